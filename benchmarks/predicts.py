@@ -31,11 +31,10 @@ from threadpoolctl import threadpool_limits
 from benchmarks.baseline import MODELS, Job, compute, recorded, records_of_tests, training
 from softneck.identification import INFINITE, Model, SetMembership, choose, identify, validate
 from softneck.signals import signal
-from tests.foreign_necks.held_out import HELD_OUT
 from tests.foreign_necks.kept import keep, kept_lines
 from tests.foreign_necks.necks import CHOOSING
 
-SHOWN = (*CHOOSING, "paper", "rough", *HELD_OUT)
+SHOWN = (*CHOOSING, "paper", "rough")
 OUT = Path("build/predicts")
 # What is judged; `residual` and `ensemble` are made of these, and the baseline has the paper's form of `nlsm`.
 KINDS = ("rls", "oe", "greybox", "play", "nn")

@@ -298,7 +298,9 @@ def test_a_guess_that_lacks_something_is_written_as_far_as_it_goes(call: Call, t
     assert (said.code, said.out) == (2, "")
     last = said.err.splitlines()[-1]
     assert last.startswith("softneck: log.csv: not found: roll: is it 'wind'? Write `roll = { column = 'wind'")
-    assert "fill in what is MISSING, and use --layout r.layout.toml" in said.err.splitlines()[-2]
+    # Above it stand both ways on: the layout, and the columns by their names.
+    assert "fill in what is MISSING, and use --layout r.layout.toml" in said.err
+    assert "or name the columns: `softneck import log.csv --motor target1" in said.err.splitlines()[-2]
     assert {path.name for path in tmp_path.iterdir()} == {"log.csv", "r.layout.toml"}
     text = (tmp_path / "r.layout.toml").read_text()
     assert "# MISSING roll: is it 'wind'?" in text

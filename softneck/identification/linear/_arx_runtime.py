@@ -9,7 +9,7 @@ from softneck.runtime._layout import array
 class ArxArrays(NarxArrays):
     """Eq. 23 of each output."""
 
-    redefinition = array("c = outputs | outputs + 1, motors", "T of Eq. 9-11: motors to redefined inputs")
+    redefinition = array("c, motors", "T of Eq. 9-11: motors to redefined inputs")
     a = array("outputs, na", "of the outputs, newest first")
     b = array("outputs, nb", "of the redefined inputs, newest first")
     delay = array("outputs", "dead time of each axis [samples]")

@@ -34,7 +34,7 @@ class NlsmArrays(NarxArrays):
     bounds = array("outputs, 2", "gamma [rad] and epsilon [rad] of each axis (Eq. 15-17)")
     nodes = array("outputs, branches, columns", "tree over the points (see `_principal_tree_runtime`)")
     frame = array("outputs, directions, n", "directions of the tree")
-    redefinition = array("c = outputs | outputs + 1, motors", "T of Eq. 9-11, for the base")
+    redefinition = array("c, motors", "T of Eq. 9-11, for the base")
     a = array("outputs, na", "of the base's outputs, newest first")
     b = array("outputs, nb", "of its redefined inputs, newest first")
     delay = array("outputs", "dead time of each axis [samples]")

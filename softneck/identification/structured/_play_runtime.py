@@ -23,7 +23,7 @@ class PlayArrays(NarxArrays):
     """The bank of operators and filters, and the polynomial over it."""
 
     load = array("4", "where a drive stalls: pole, c, c1, c2 (see `_bank_runtime`)")
-    redefinition = array("c = outputs | outputs + 1, motors", "T of Eq. 9-11: motors to redefined inputs")
+    redefinition = array("c, motors", "T of Eq. 9-11: motors to redefined inputs")
     widths = array("w", "widths of the play operators behind each redefined input [rad]")
     chain = array("2", "pole and number of the equal low-pass filters behind each operator")
     table = array("terms, 3", "signals of the bank that each term multiplies; -1 stands for 1")

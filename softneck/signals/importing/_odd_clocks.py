@@ -100,4 +100,4 @@ def double_stamps(time: Vector, run: Sequence[int] | np.ndarray) -> np.ndarray:
     if usual > 0.0:
         twice = (step[:-1] == 0.0) & inside[:-1] & inside[1:] & (np.abs(step[1:] / usual - 2.0) < 0.5)
         found[1:-1] = twice
-    return found if found.mean() < _RARE else np.zeros(time.size, dtype=bool)
+    return found if not found.any() or found.mean() < _RARE else np.zeros(time.size, dtype=bool)
