@@ -363,7 +363,7 @@ def _check(name: str, axis: AxisFamily, frequencies: int) -> None:
     n = axis.samples.shape[0]
     shapes = {
         "samples": (n, 3), "std": (n, 4), "where": (n, 5), "used": (n,), "nominal": (3,), "box": (2, 3),
-        "weight": (2, min(max(axis.weight.shape[-1], 2), 4)), "envelope": (frequencies,),
+        "weight": (2, min(max(axis.weight.shape[-1], 1), 4)), "envelope": (frequencies,),
     }  # fmt: skip
     for key, shape in shapes.items():
         if getattr(axis, key).shape != shape:
