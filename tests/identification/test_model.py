@@ -120,7 +120,7 @@ CRAFTED = [
     ("play", "chain", lambda a: a + 0.5, "the order of the filters"),
     ("play", "echo", lambda a: a[:1], "`echo` has shape"),
     ("play", "memory", lambda a: a * 1e9, "its memory in samples"),
-    ("greybox", "neck", lambda a: a * 1e6, "drive_rate of .* is out of range"),
+    ("greybox", "neck", lambda a: a * 1e6, "(drive_rate of .* is out of range|directions of its tendons)"),
     ("greybox", "sensor", lambda a: a + 0.5, "the sensor's dead time"),
     ("guarded", "memory", lambda a: a * 1e9, "its memory in samples"),
     ("guarded", "3.nn.w3", lambda a: a * np.nan, "`w3` is not of finite floats"),
