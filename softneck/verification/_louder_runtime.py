@@ -30,7 +30,7 @@ class LouderState(StateVector):
 def initialise(p: LouderArrays, parameters: np.ndarray, x: LouderState, outputs: np.ndarray) -> None:
     """Start with zero errors and no disturbance."""
     x[:] = 0.0
-    random_seed(x.random, parameters[parameters.shape[0] - 1])
+    random_seed(x.random, float(parameters[parameters.shape[0] - 1]))
     outputs[:] = 0.0
 
 

@@ -47,11 +47,11 @@ def sweep(L: Any, wn: float, damping: float) -> dict[str, float]:
         inner = places[(places > 0) & (places < w.size - 1)]
         tops = inner[(v[inner] >= v[inner - 1]) & (v[inner] >= v[inner + 1])]
         found[name] = max(float(v.max()), *(size(response(L, zoomed(L, w, size, tops)))), 0.0)
-    real = np.flatnonzero((H.imag[1:] > 0.0) != (H.imag[:-1] > 0.0))
-    at = response(L, zoomed(L, w, lambda H: -np.abs(H.imag), real))
+    real = np.flatnonzero((np.imag(H)[1:] > 0.0) != (np.imag(H)[:-1] > 0.0))
+    at = response(L, zoomed(L, w, lambda H: -np.abs(np.imag(H)), real))
     # At the Nyquist frequency a loop is real; at zero without an integrator as well.
-    ends = [H[-1].real] + ([H[0].real] if abs(H[0].imag) < 1e-3 * abs(H[0].real) else [])
-    factors = np.array([-1.0 / x for x in (*at.real, *ends) if x < 0.0])
+    ends = [np.real(H[-1])] + ([np.real(H[0])] if abs(np.imag(H[0])) < 1e-3 * abs(np.real(H[0])) else [])
+    factors = np.array([-1.0 / x for x in (*np.real(at), *ends) if x < 0.0])
     found["gain"] = float(np.min(factors[factors > 1.0], initial=math.inf))
     found["gain_down"] = float(np.max(factors[factors < 1.0], initial=0.0))
     one = np.flatnonzero((np.abs(H[1:]) > 1.0) != (np.abs(H[:-1]) > 1.0))
@@ -64,7 +64,7 @@ def sweep(L: Any, wn: float, damping: float) -> dict[str, float]:
 
 def mode(wn: float, damping: float, lag: float, Ts: float, delay: int) -> Any:
     """Return a lightly damped mode behind a lag (0: none) and a dead time, of gain 1 at its frequency."""
-    s = control.tf("s")
+    s: Any = control.tf("s")
     G: Any = wn**2 / (s**2 + 2.0 * damping * wn * s + wn**2)
     if lag:
         G = G / (s / lag + 1.0)
@@ -225,7 +225,8 @@ def test_a_design_keeps_its_bounds_exactly_and_its_worst_is_no_better_than_the_n
 ) -> None:
     plants = []
     for wn, damping in ((12.0, 0.05), (12.5, 0.06), (11.5, 0.07)):
-        G: Any = 0.1 * control.tf([wn**2], [1.0, 2.0 * damping * wn, wn**2])
+        mode: Any = control.tf([wn**2], [1.0, 2.0 * damping * wn, wn**2])
+        G = 0.1 * mode
         plants.append(control.c2d(G, 0.005) * control.TransferFunction([1.0], [1.0, 0.0, 0.0], 0.005))
     found = PiSettings(tuning=tuning).design({"pitch": plants, "roll": plants}).design["pitch"]
     assert found["family"] == 3

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import parso
-from cosmic_ray.operators import operator
+import parso  # pyright: ignore[reportMissingImports]
+from cosmic_ray.operators import operator  # pyright: ignore[reportMissingImports]
 
 # Its methods are declared to return nothing.
 Operator: Any = operator.Operator

@@ -88,14 +88,16 @@ def loop_margins(loop: control.TransferFunction | control.StateSpace) -> Margins
         above, below = (np.trim_zeros(np.asarray(part[0][0], dtype=float), "f") for part in (loop.num, loop.den))
         poles, size = np.roots(np.polyadd(below, above)), max(below.size, above.size) - 1
     else:
-        poles, size = np.linalg.eigvals(loop.A - loop.B @ loop.C / (1.0 + loop.D[0, 0])), loop.nstates
+        A, B, C, D = (np.asarray(matrix, dtype=float) for matrix in (loop.A, loop.B, loop.C, loop.D))
+        poles, size = np.linalg.eigvals(A - B @ C / (1.0 + D[0, 0])), loop.nstates
     require_stable(poles)
+    Ts = float(loop.dt)
 
     def evaluate(_: np.ndarray, w: Vector) -> tuple[np.ndarray, np.ndarray]:
-        L = np.asarray(loop(np.exp(1j * w * float(loop.dt)), squeeze=False))[0, 0]
+        L = np.asarray(loop(np.exp(1j * w * Ts), squeeze=False))[0, 0]
         return sensitivity_of(L)[:, None], np.zeros((w.size, 0))
 
-    return margins_of_loops(evaluate, poles[None], float(loop.dt), size).of(0)
+    return margins_of_loops(evaluate, poles[None], Ts, size).of(0)
 
 
 def require_stable(poles: np.ndarray) -> None:
@@ -246,18 +248,19 @@ def _crossings(evaluate: Evaluate, tracks: list[_Track], n: int, c: int) -> dict
     phase, delay, crossover = np.full((n, c), math.inf), np.full((n, c), math.inf), np.full((n, c), math.nan)
     # Zero and Nyquist frequency, where a loop is real.
     for S in (tracks[0].S[:, 0], tracks[0].S[:, -1]):
-        factor, rows = np.where(np.abs(S.imag) < 1e-3 * np.abs(S.real), _factors(S.real), math.nan), tracks[0].rows
+        rows, real = tracks[0].rows, np.real(S)
+        factor = np.where(np.abs(np.imag(S)) < 1e-3 * np.abs(real), _factors(real), math.nan)
         up[rows] = np.fmin(up[rows], np.where(factor > 1.0, factor, math.nan))
         down[rows] = np.fmax(down[rows], np.where(factor < 1.0, factor, math.nan))
-    real = [_brackets(track, track.S.imag, down=down, up=up) for track in tracks]
-    rows, channels, w = (np.concatenate(parts) for parts in zip(*real, strict=True))
-    rows, channels, _, S = _roots(evaluate, (rows, channels, w), lambda S: S.imag)
-    factor = _factors(S.real)
+    axis = [_brackets(track, np.imag(track.S), down=down, up=up) for track in tracks]
+    rows, channels, w = (np.concatenate(parts) for parts in zip(*axis, strict=True))
+    rows, channels, _, S = _roots(evaluate, (rows, channels, w), lambda S: np.imag(S))
+    factor = _factors(np.real(S))
     np.fmin.at(up, (rows, channels), np.where(factor > 1.0, factor, math.nan))
     np.fmax.at(down, (rows, channels), np.where(factor < 1.0, factor, math.nan))
-    circle = [_brackets(track, track.S.real - 0.5) for track in tracks]
+    circle = [_brackets(track, np.real(track.S) - 0.5) for track in tracks]
     rows, channels, w = (np.concatenate(parts) for parts in zip(*circle, strict=True))
-    rows, channels, w, S = _roots(evaluate, (rows, channels, w), lambda S: S.real - 0.5)
+    rows, channels, w, S = _roots(evaluate, (rows, channels, w), lambda S: np.real(S) - 0.5)
     late = (np.angle(1.0 / S - 1.0) + math.pi) % (2.0 * math.pi)
     angle = np.minimum(late, 2.0 * math.pi - late)
     np.fmin.at(phase, (rows, channels), angle)
@@ -284,7 +287,8 @@ def _brackets(
     k, j, c = np.nonzero((f[:, 1:] > 0.0) != (f[:, :-1] > 0.0))
     if down is not None and up is not None:
         a, b = f[k, j, c], f[k, j + 1, c]
-        factor = _factors(track.S.real[k, j, c] + a / (a - b) * (track.S.real[k, j + 1, c] - track.S.real[k, j, c]))
+        real = np.real(track.S)
+        factor = _factors(real[k, j, c] + a / (a - b) * (real[k, j + 1, c] - real[k, j, c]))
         rows = track.rows[k]
         nearest_up, nearest_down = up.copy(), down.copy()
         np.fmin.at(nearest_up, (rows, c), np.where(factor > 1.0, factor, math.nan))

@@ -167,7 +167,7 @@ def require_same_again(loop: Loop, certificate: Certificate) -> float:
         name = loop.robot.own(said)
         values = again.angle(name) if name in loop.robot.outputs.names else again[name]
         for row, value in zip(trace["row"], certified, strict=True):
-            if row < len(values) and not _same(values[row], value):
+            if row < len(values) and not _same(float(values[row]), value):
                 expected = math.nan if value is None else value
                 raise CheckFailedError(
                     f"{certificate.path}: the loop does not do again what was certified: `{name}` is {values[row]:.6g} "
