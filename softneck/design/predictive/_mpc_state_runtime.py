@@ -65,7 +65,7 @@ class MpcArrays(Arrays):
 
     _z, _m = "motors * moves + slacks", "(references - 1)"
     _theta = f"{_m} * (n + 2) + {_m} * L + motors + 2"
-    constants = array("numbers = 17 | 17 + 2 * motors + 3 * references", "see MPC_TS to MPC_NUMBERS")
+    constants = array("numbers = 17 | 16 + 2 * motors + 4 * references", "see MPC_TS to MPC_NUMBERS")
     model_A = array(f"{_m} * n, n", "A of each model, below each other")
     model_B = array(f"{_m}, entries", "B of each model, one input behind the other")
     observer = array(f"{_m}, 3", "gains on o and r, and the pole a")

@@ -66,7 +66,7 @@ def test_a_sensor_of_ones_own(tmp_path: Path) -> None:
         ('kind = "python"\npython = "bad_sensor_for_test:broken"', SensorError, "OSError: no such sensor"),
         ('kind = "python"\npython = "bad_sensor_for_test:nothing"', SettingsError, "a sensor without `take`"),
         ('kind = "simulated"', SettingsError, r'kind is "simulated"; on a bus it must be one of can, serial'),
-        ('kind = "gx5"', SettingsError, "`kind` must be one of simulated, can, serial, python"),
+        ('kind = "gx5"', SettingsError, r"`\[sensor\] kind` must be one of simulated, can, serial, python"),
     ],
 )
 def test_a_sensor_that_cannot_be_opened_is_one_line(
