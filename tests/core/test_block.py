@@ -126,6 +126,19 @@ def test_a_wrong_parameter_is_named(block_of: Callable[[str], Block], parameters
         block_of("rls").initial_state(**parameters)
 
 
+def test_a_row_alone_is_checked_as_in_a_record(block_of: Callable[[str], Block]) -> None:
+    block = block_of("rls")
+    state = block.initial_state()
+    large = np.array([1e200, -1e200, 1e300, *[0.1] * 5])
+    stepped, y = block.step(state, large)
+    end, Y = block.run(state, large[None])
+    np.testing.assert_array_equal(y, Y[0])
+    np.testing.assert_array_equal(stepped.values, end.values)
+    for wrong in ([np.inf, -np.inf], [np.nan, 0.0]):
+        with pytest.raises(DataError, match=r"input `motor_setpoint_1` of rls is"):
+            block.step(state, [*wrong, *large[2:]])
+
+
 def test_wrong_inputs_are_named(block_of: Callable[[str], Block]) -> None:
     block = block_of("rls")
     state = block.initial_state()
