@@ -141,7 +141,9 @@ def gather(
             progress=late,
         ))  # fmt: skip
         if "sim.slack_s" not in evidence.metrics:
-            evidence.not_computed["sim.slack_s"] = "draws have no tension outputs; give a NECK, a file or a preset"
+            evidence.not_computed["sim.slack_s"] = (
+                "draws have no tension outputs; verify over FAMILY and a NECK (`softneck.calibrate` in Python makes it)"
+            )
     _add_drawn(evidence, {name for item in evidence.drawn for name in item.values})
     progress(1.0, "done")
     return evidence

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -204,6 +204,14 @@ class Requirements(ReprMixin):
         """Return the requirements with defaults of a scale, unless this robot's scale is known already."""
         kept = scale.robot.hash == self.robot.hash and self.scale.known
         return self if kept else make_requirements(self.own, scale=scale)
+
+    def over_draws(self) -> Requirements:
+        """Return the requirements where draws decide: the error under the load is one of their loops too."""
+        load, simulated = (self.scale.name_of(f"{group}.load_rms_deg") for group in ("step", "sim"))
+        if simulated in self.own.get("require", {}):
+            return self
+        more = [replace(item, metric=simulated) for item in self.bounds if item.metric == load]
+        return replace(self, bounds=(*self.bounds, *more))
 
 
 def read_requirements(

@@ -270,6 +270,8 @@ def verify(
         asked = make_requirements(expand_metrics(requirements, robot, stepping=bool(own)), scale=scale)
     else:
         asked = read_requirements(requirements, scale=scale)
+    if any(getattr(thing, "draws", None) is not None for thing in linear.values()):
+        asked = asked.over_draws()
     necks = sources_of(linear, asked)
     eyes = None if observer is None else observer.block()
     judged = controller_under_test(controller, order=order, observer=observer is not None)

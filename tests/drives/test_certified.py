@@ -14,8 +14,9 @@ from softneck.cosim import load_loop, simulate
 from softneck.drives import prepare
 from softneck.drives.running._certified import ARMING, SAME, require_certified, require_same_again
 from softneck.verification import read_requirements
+from softneck.verification._drawn import certified_content
 
-from .certified import verified_rows, write_verified
+from .certified import drawn_rows, verified_rows, write_verified
 from .conftest import STEP, Project
 
 DRIVES = 'profile = "ipos2015"\n' + "".join(f"[[drive]]\nnode = {n}\npeak_current_A = 10.0\n" for n in (1, 2, 3))
@@ -92,6 +93,62 @@ def test_each_metric_of_the_minimum_is_needed_as_strictly_as_by_default(
             continue
         with pytest.raises(CheckFailedError, match=rf"does not show `{metric}` .*{refused}"):
             require_certified(setup, project.controller, [path])
+
+
+DRAWS = {"family": "f.npz", "count": 59, "failed": [], "attempt": 4, "content": certified_content(59, 4)}
+
+
+def test_a_certificate_of_draws_arms_by_what_their_loops_show(project: Project, tmp_path: Path) -> None:
+    setup, path = load_loop(project.loop), tmp_path / "verified.json"
+    write_verified(project.controller, drawn_rows(), path, draws=[DRAWS])
+    assert require_certified(setup, project.controller, [path]) is not None
+    # Without draws the linear rows, which decide nothing here, are what is asked for.
+    write_verified(project.controller, drawn_rows(), path)
+    with pytest.raises(CheckFailedError, match=r"does not show `stability\.radius` .*: shown only\. Verify again"):
+        require_certified(setup, project.controller, [path])
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "refused"),
+    [
+        ("axes.gain_margin", {"limit": 1.5}, "it asks for 1.5, the default is 2"),
+        ("axes.delay_margin_ms", {"holds": False}, "it does not hold"),
+        ("sim.overshoot_pct", {"limit": 16.0}, "it asks for 16, the default is 15"),
+        ("sim.load_rms_deg", None, "it was not asked for"),
+        ("sim.slack_s", {"holds": None, "note": "not computed: verify over FAMILY and a NECK"}, "verify over FAMILY"),
+    ],
+)
+def test_a_certificate_of_draws_that_shows_too_little_is_refused(
+    project: Project, tmp_path: Path, name: str, change: dict | None, refused: str
+) -> None:
+    rows = drawn_rows()
+    if change is None:
+        del rows[name]
+    else:
+        rows[name] |= change
+    holds = all(row["holds"] is not False for row in rows.values())
+    path = write_verified(project.controller, rows, tmp_path / "verified.json", draws=[DRAWS])
+    message = rf"does not show `{name}` .*{refused}" if holds else rf"{name} did not hold"
+    with pytest.raises(CheckFailedError, match=message):
+        require_certified(load_loop(project.loop), project.controller, [path])
+
+
+@pytest.mark.parametrize(
+    "draws",
+    # JSON has no NaN, a text that is read as one has it.
+    [
+        [DRAWS | {"failed": [3]}],
+        [DRAWS, DRAWS | {"content": 0.89}],
+        [{}],
+        [DRAWS, DRAWS | {"content": "nan"}],
+        "59",
+        59,
+    ],
+)
+def test_draws_that_fail_or_are_too_few_arm_nothing(project: Project, tmp_path: Path, draws: object) -> None:
+    path = write_verified(project.controller, drawn_rows(), tmp_path / "verified.json", draws=draws)
+    with pytest.raises(CheckFailedError, match=r"its draws stand for .* make the family with --draws 59"):
+        require_certified(load_loop(project.loop), project.controller, [path])
 
 
 def test_a_loop_certificate_covers_each_file_for_the_whole_run(project: Project, tmp_path: Path) -> None:

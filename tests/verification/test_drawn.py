@@ -47,8 +47,9 @@ def test_as_many_draws_as_wilks_asks_for_are_needed(share: float, least: int) ->
 def test_draws_decide_and_the_linear_test_is_shown_beside(drawn: Draws) -> None:
     found = verify(pi(), {"family": with_draws(drawn)}, make_requirements(ASKED))
     verdicts = {v.requirement.metric: v for v in found.verdicts}
-    for name in ("axes.gain_margin", "axes.delay_margin_ms", "sim.overshoot_pct"):
+    for name in ("axes.gain_margin", "axes.delay_margin_ms", "sim.overshoot_pct", "sim.load_rms_deg"):
         assert verdicts[name].worst["kind"] == "draw"
+    assert verdicts["sim.load_rms_deg"].requirement.limit == verdicts["step.load_rms_deg"].requirement.limit
     beside = [v for v in found.verdicts if v.requirement.metric.startswith(("stability", "robust", "step", "mimo"))]
     for verdict in beside:  # a linear test that fails decides nothing
         assert verdict.value is not None
