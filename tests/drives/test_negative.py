@@ -21,10 +21,12 @@ from softneck.drives.master._gate import BAD, DROPOUT, FROZEN, Gate
 from softneck.drives.master._master import Master, Measurement
 from softneck.drives.master._settings import LimitSettings, WatchSettings
 from softneck.drives.master._watches import Watches, timing
-from softneck.drives.running import _certified, _preflight
+from softneck.drives.running import _certified, _preflight, _stop
 from softneck.drives.running._certified import SAME, _as_strict, require_same_again
+from softneck.drives.running._pilot import SignalLog
 from softneck.drives.running._preflight import PreflightCheck, Report, foreign_master, set_points_of_others
 from softneck.drives.running._stop import require_reset, require_stopped
+from softneck.signals import NECK
 
 FILE = default_drives()
 ENTRY = FILE.drives[0]
@@ -280,6 +282,44 @@ def test_a_drive_that_may_have_power_is_not_stopped_and_one_in_fault_not_reset()
     for state in ("FAULT", "no answer"):
         with pytest.raises(CheckFailedError, match=f"node 2: {state}"):
             require_reset({1: "DISABLED", 2: state})
+
+
+def test_stop_and_reset_write_the_control_word_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """CiA 402: 6040h has no subindex; a rising edge of bit 7 resets a fault."""
+    drives = {entry.node: Told({(0x6041, 0): 0x0250}) for entry in FILE.drives}
+    sent: list[Frame] = []
+    link = SimpleNamespace(now=0.0, send=sent.extend)
+    link.receive = lambda seconds: setattr(link, "now", link.now + seconds)
+    monkeypatch.setattr(_stop, "Objects", lambda _, node: drives[node])
+    monkeypatch.setattr(_stop, "require_alone", lambda _: None)
+    monkeypatch.setattr(_stop, "require_bus", lambda _: None)
+    off = dict.fromkeys(drives, "DISABLED")
+    assert _stop.reset(link, FILE) == off  # pyright: ignore[reportArgumentType]
+    assert [drive.written for drive in drives.values()] == [[(0x6040, 0, word) for word in (0, 0x80, 0)]] * len(drives)
+    assert not sent
+    assert _stop.stop(link, FILE) == off  # pyright: ignore[reportArgumentType]
+    assert all(drive.written[3:] == [(0x6040, 0, 0)] for drive in drives.values())
+    # An expedited download of two bytes: quick stop, twice to each.
+    told = bytes([0x2B, 0x40, 0x60, 0, 0x02, 0, 0, 0])
+    assert sent == 2 * [Frame(0x600 + node, told) for node in drives]
+
+
+def test_a_sample_is_logged_once_with_the_set_points_that_were_sent_to_its_end() -> None:
+    """A set-point that a limit moves within a sample is complete with the last cycle of it."""
+    logged: list[dict[str, float]] = []
+    told = SimpleNamespace(
+        file=SimpleNamespace(moves=NECK), log=SimpleNamespace(signals=logged.append), folder=None, link=None
+    )
+    log = SignalLog(3, session=told)  # pyright: ignore[reportArgumentType]
+    master = SimpleNamespace(
+        positions=(0.0,) * 3, tensions=(0.0,) * 3, tilt=None, supervisor=SimpleNamespace(phase=Phase.RUNNING),
+        settings=SimpleNamespace(sample_cycles=4),
+    )  # fmt: skip
+    for cycle in range(10):
+        master.index, master.setpoints = cycle // 4, (0.1 * cycle,) * 3
+        log(0.005 * cycle, (), (), None, master)  # pyright: ignore[reportArgumentType]
+    assert [row["motor_setpoint_1"] for row in logged] == [0.1 * 3, 0.1 * 7]
+    assert log.rows == 2
 
 
 # -- certificates -----------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from softneck.verification import _evidence, _experiments, _linear, _neck_loops,
 from softneck.verification._evidence import Evidence, Values, worst_row
 from softneck.verification._experiments import Crossing, crossing_values
 from softneck.verification._linear import LARGE, SMALL, LinearLaw, margins
+from softneck.verification._metrics import Scale
 from softneck.verification._neck_loops import LoopRun, judge_loop
 from softneck.verification._plants import nominal_plants, source_of_family
 from softneck.verification._requirements import Requirement, make_requirements
@@ -311,3 +312,16 @@ def test_an_oscillation_is_the_largest_of_all_outputs() -> None:
     assert _experiments._oscillation(np.arange(5.0), 10.0) == 0.0
     assert _experiments._oscillation(np.arange(5.0), 4.0) == 4.0
     assert math.isnan(_experiments._oscillation(np.array([0.0, math.nan]), 1.0))
+
+
+def test_limits_of_a_robot_follow_its_smallest_output_and_its_order_changes_nothing() -> None:
+    def size(*nominal: float) -> float:
+        robot = Robot.from_dict({
+            "name": "stage", "motors": {"names": ["a", "b"], "unit": "V", "nominal": 5.0, "setpoint_min": 0.0,
+                                        "setpoint_max": 10.0},
+            "outputs": {"names": ["x", "y"], "unit": "mm", "nominal": list(nominal)},
+            "directions": {"kind": "matrix", "matrix": [[1.0, 0.0], [0.0, 1.0]]}, "time_constant_s": 0.2,
+        })  # fmt: skip
+        return Scale.of(robot).size
+
+    assert size(2.0, 8.0) == size(8.0, 2.0) == size(2.0, 2.0) < size(8.0, 8.0)
