@@ -95,8 +95,9 @@ def test_an_unknown_channel_and_a_wrong_shape_are_named() -> None:
         with_time(r, r.time, np.zeros(5, dtype=int))
     with pytest.raises(DataError, match="the recording has no rows"):
         r.rows(5, 5)
-    with pytest.raises(SettingsError, match="`sample_time` must be positive"):
-        Recording(r.time, 0.0, r.channels)
+    for sample_time in (0.0, 1e-294, 1e286):
+        with pytest.raises(SettingsError, match=r"`sample_time` must be between 1e-09 and 1e\+09 \[s\]"):
+            Recording(r.time, sample_time, r.channels)
 
 
 def test_time_that_runs_backwards_or_jumps_is_named() -> None:

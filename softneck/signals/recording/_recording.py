@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import DataError, Matrix, ReprMixin, Vector, finite_matrix, require_positive, resolve, to_si
+from softneck.core import DataError, Matrix, ReprMixin, Vector, finite_matrix, require_between, resolve, to_si
 from softneck.robot import Robot, Scaling, find_robot, round_scaled, scaled_robot
 
 from ._channels import NECK, known_channels, may_miss
@@ -77,6 +77,8 @@ def median_step(time: Vector, run: np.ndarray) -> float:
 
 # [s] Used if neither the caller nor the robot gives one.
 _DEFAULT_SAMPLE_TIME_S = 0.02
+# No robot is recorded faster than at 1 GHz, or once in 30 years [s].
+_SAMPLE_TIMES = 1e-9, 1e9
 _FILES_MODULE = "softneck.signals.recording._files"  # resolved by name: `_files` imports this module
 
 
@@ -109,7 +111,7 @@ class Recording(ReprMixin):
     robot: Robot = NECK
 
     def __post_init__(self) -> None:
-        require_positive("sample_time", self.sample_time, "s")
+        require_between("sample_time", self.sample_time, *_SAMPLE_TIMES, "s")
         time = np.ascontiguousarray(self.time, dtype=np.float64)
         run = np.zeros(time.size, dtype=np.int64) if self.run.size == 0 else self.run.astype(np.int64)
         channels = {
