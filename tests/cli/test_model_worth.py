@@ -48,6 +48,7 @@ def test_a_model_that_moves_the_wrong_way_gives_exit_code_1(call: Call, rls_file
     assert "its fit in simulation is -1" in said.error
 
 
+@pytest.mark.slow
 def test_identify_of_outputs_that_follow_no_motor_gives_exit_code_1_and_what_to_do(call: Call) -> None:
     # Another neck's angles beside motors that move: the mean of the rows held out knows more than any model.
     moving, other = neck_recording(3000), neck_recording(3000, seed=5)

@@ -156,7 +156,7 @@ MODES = [
 
 
 @pytest.mark.parametrize(("share", "damping", "sample_time"), MODES)
-@pytest.mark.parametrize(("motors", "unit"), [(1, "kPa"), (3, "rad")])
+@pytest.mark.parametrize(("motors", "unit"), [(1, "kPa"), pytest.param(3, "rad", marks=pytest.mark.slow)])
 def test_a_lightly_damped_mode_is_named_and_the_output_beside_it_is_not(
     share: float, damping: float, sample_time: float, motors: int, unit: str
 ) -> None:
