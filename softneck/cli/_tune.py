@@ -57,6 +57,7 @@ def command(
               best.certificate.json  of verify with the same requirements, if it holds
               loop.toml              a loop with both, for softneck simulate
               pareto.csv, .json      the Pareto front, and report.html
+              tuner.html             all candidates, chosen by two sliders
               requirements.toml      all requirements, for tune and verify
               evaluations.json       all evaluations: the same command continues from them
     Defaults of speed and precision that no candidate keeps are loosened to what the best keeps, by a factor of two at
@@ -79,9 +80,7 @@ def command(
             seed=seed, workers=workers, folder=output, force=force, progress=report,
             files={role: (str(item), file_hash(item)) for role, item in files.items()},
         )  # fmt: skip
-    steps = {name: item if item.exists() else str(item) for name, item in zip(things, plants, strict=True)
-             if verification.is_simulation_model(things[name])}  # fmt: skip
-    values = write_tuned(found, output, files, steps)
+    values = write_tuned(found, output, dict(zip(things, plants, strict=True)))
     if as_json:
         print_json(values)
     else:

@@ -17,6 +17,7 @@ from ._recording_pages import quality_page as quality_page
 from ._chart import BLUE as BLUE
 from ._chart import GREEN as GREEN
 from ._chart import GREY as GREY
+from ._chart import MOTOR_COLOURS as MOTOR_COLOURS
 from ._chart import ORANGE as ORANGE
 from ._chart import curve_styles as curve_styles
 from ._charts import cover_chart as cover_chart
@@ -29,5 +30,6 @@ from ._charts import recording_chart as recording_chart
 from ._charts import residual_chart as residual_chart
 from ._charts import validation_chart as validation_chart
 from ._neck3d import why_not_drawn as why_not_drawn
+from ._page import Script as Script
 from ._page import cell as cell
 from ._recording_pages import import_page as import_page

@@ -56,7 +56,7 @@ async function draw() {
       });
   }
 }
-draw().catch(error => {
+draw().then(() => document.dispatchEvent(new Event("drawn"))).catch(error => {
   for (const chart of document.querySelectorAll(".chart"))
     if (!chart.shadowRoot && !chart.childElementCount) chart.textContent = "This plot could not be drawn here: " + error;
   throw error;

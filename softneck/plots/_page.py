@@ -47,6 +47,7 @@ class Section(ReprMixin):
         tables: under the charts.
         findings: (severity, sentence) pairs, a numbered list; severity is ok, note or warning.
         method: paragraphs at the end: definitions and methods of the numbers.
+        html: controls above the charts, as trusted HTML.
     """
 
     title: str
@@ -55,11 +56,21 @@ class Section(ReprMixin):
     charts: Sequence[Chart] = ()
     findings: Sequence[tuple[str, str]] = ()
     method: Sequence[str] = ()
+    html: str = ""
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Script(ReprMixin):
+    """JavaScript that runs when the charts are drawn; it reads `data` (JSON values) by `await unpacked("data")`."""
+
+    text: str
+    data: Any
 
 
 def page(
-    title: str, sections: Sequence[Section], *, verdict: str = "", holds: bool | None = None, footer: str = ""
-) -> str:
+    title: str, sections: Sequence[Section], *, verdict: str = "", holds: bool | None = None, footer: str = "",
+    script: Script | None = None,
+) -> str:  # fmt: skip
     """Return the HTML text of a page; all text is escaped, charts and their library are included.
 
     Its content security policy forbids every request.
@@ -69,18 +80,20 @@ def page(
         verdict: one sentence, at the top.
         holds: whether the verdict is good or bad; None: neither.
         footer: program that wrote the page.
+        script: of the controls in the sections' `html`.
     """
     import jinja2
 
     charts = iter(thin_charts([chart for section in sections for chart in section.charts]))
     drawn: dict[str, Any] = {}
     parts = [_part(number, section, charts, drawn) for number, section in enumerate(sections, start=1)]
-    packed = Markup(gzip_base64(json.dumps(drawn, separators=(",", ":")).encode()))
-    script = Markup(library()) if any(section.charts for section in sections) else ""
+    packed = _packed(drawn)
+    own = None if script is None else {"text": Markup(script.text), "data": _packed(script.data)}
+    code = Markup(library()) if any(section.charts for section in sections) else ""
     template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(_file("_page.html"))
     return template.render(
         title=title, verdict=verdict, mark={None: "", True: "holds", False: "fails"}[holds], sections=parts,
-        footer=footer, library=script, licence=LICENCE, charts=packed, start=Markup(_file("_page.js")),
+        footer=footer, library=code, licence=LICENCE, charts=packed, start=Markup(_file("_page.js")), script=own,
     )  # fmt: skip
 
 
@@ -92,7 +105,11 @@ def _part(number: int, section: Section, charts: Iterator[Chart], drawn: dict[st
         drawn[name], height = draw(chart)
         parts.append({"id": name, "title": chart.title, "caption": chart.caption, "height": height})
     taken = {name: getattr(section, name) for name in ("title", "text", "tables", "findings", "method")}
-    return {**taken, "charts": parts}
+    return {**taken, "charts": parts, "html": Markup(section.html)}
+
+
+def _packed(values: Any) -> Markup:
+    return Markup(gzip_base64(json.dumps(values, separators=(",", ":")).encode()))
 
 
 def _file(name: str) -> str:

@@ -10,14 +10,17 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import tomli_w
 
 from softneck.core import atomic_write, file_hash, write_certificate
 from softneck.design import assumed_lines
 from softneck.loop import error_unit
 from softneck.plots import GREY, Chart, Curve, Panel, Section, Table, cell, curve_styles, page, write_page
-from softneck.tuning import step_response
+from softneck.tuning import curve_times
 from softneck.verification import metric_title, nominal_plants, sources_of, write_linear
+
+from ._tuner import tuner_page
 
 if TYPE_CHECKING:
     from softneck.tuning import Candidate, Tuned
@@ -27,15 +30,14 @@ BEST, OBSERVER, CERTIFICATE, LOOP = "best.npz", "observer.npz", "best.certificat
 _LOOP_AT, _LOOP_TAUT = 1.0, 3.0
 
 
-def write_tuned(
-    found: Tuned, folder: Path, files: Mapping[str, Path], steps: Mapping[str, Path | str]
-) -> dict[str, Any]:
+def write_tuned(found: Tuned, folder: Path, plants: Mapping[str, Path]) -> dict[str, Any]:
     """Write all files of a tuning and return its JSON values.
 
     `found`: the result. `folder`: target; files of an earlier run are replaced, and its certificate is removed if this
-    one does not hold. `files`: role -> path of an input file, for the certificate. `steps`: name -> file, or preset, of
-    the simulation models.
+    one does not hold. `plants`: name -> file, or preset, of every plant.
     """
+    files = {f"plant {k}": path for k, path in enumerate(plants.values(), start=1) if path.is_file()}
+    steps = {name: path if path.exists() else str(path) for name, path in plants.items() if name in found.task.own}
     found.controller.save(folder / BEST, force=True)
     if found.observer is not None:
         found.observer.save(folder / OBSERVER, force=True)
@@ -56,6 +58,7 @@ def write_tuned(
     _write(folder / "pareto.json", json.dumps(values["pareto"], indent=1) + "\n")
     _write(folder / "pareto.csv", _csv(found))
     write_page(folder / "report.html", tune_page(found), force=True)
+    write_page(folder / "tuner.html", tuner_page(found, folder, plants, certified=_verdict(found)), force=True)
     return values
 
 
@@ -159,10 +162,14 @@ def tune_page(found: Tuned) -> str:
     return page(
         f"Controller for {found.task.robot.label()}, tuned",
         [_result(found, _steps(found, items)), _front(found), given],
-        verdict=tune_verdict(found) if found.holds else f"Not all requirements hold. {failing_requirement(found)}",
+        verdict=_verdict(found),
         holds=found.holds,
         footer="Written by softneck tune.",
     )
+
+
+def _verdict(found: Tuned) -> str:
+    return tune_verdict(found) if found.holds else f"Not all requirements hold. {failing_requirement(found)}"
 
 
 def tune_verdict(found: Tuned) -> str:
@@ -246,11 +253,14 @@ def _result(found: Tuned, steps: Chart) -> Section:
 
 
 def _steps(found: Tuned, items: Sequence[Candidate]) -> Chart:
+    time = curve_times(found.task)
     curves: list[Curve] = []
-    for item, (colour, style) in zip(items[:_MAX_STEPS], curve_styles(), strict=False):
-        time, y, reference = step_response(found.task, item)
+    for item, (colour, style) in zip(
+        [item for item in items if item.curves][:_MAX_STEPS], curve_styles(), strict=False
+    ):
+        y, (size,) = np.array(item.curves["value"]), item.curves["reference"]
         if not curves:
-            curves.append(Curve(time, reference, "reference", GREY, "step"))
+            curves.append(Curve(time, np.full(time.size, size), "reference", GREY, "dashed"))
         curves.append(Curve(time, y, _label(found, item), colour, style, 2.0 if item is found.best else 1.0))
     outputs = found.task.robot.outputs
     where = "with the heaviest payload" if found.task.own else "of the nominal plant"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -41,7 +41,7 @@ from softneck.verification import (
 )
 
 from ._requirements import TuneRequirements, can_follow_circle
-from ._task import MARGINS, Judgement, Task, has_observer
+from ._task import MARGINS, Judgement, Task, circle_angles, curve_times, has_observer
 
 # Time to reach the circle [s], and turns, of which the last is judged.
 _LEAD_IN_S, _TURN_COUNT = 2.0, 2.0
@@ -225,12 +225,14 @@ def judge_candidate(task: Task, kind: str, settings: Mapping[str, Any], level: s
         ready = prepare(task)
         controller = design_candidate(task, ready, kind, settings)
         if level == "linear":
-            return Judgement(linear_metrics(task, ready, controller))
+            curves = {} if ready.own else linear_curves(task, ready, controller)
+            return Judgement(linear_metrics(task, ready, controller), curves=curves)
         block, order = controller.block(), str(getattr(controller, "order", "sequential"))
         eyes = make_observer(task, kind)
         if level == "margins":
             return Judgement(margin_metrics(task, ready, block, order, eyes))
-        return Judgement(loop_metrics(task, ready, block, order, ready.all, eyes))
+        curves = loop_curves(task, ready, block, order, eyes)
+        return Judgement(loop_metrics(task, ready, block, order, ready.all, eyes), curves=curves)
     except SoftneckError as error:
         return Judgement({}, " ".join(str(error).split()))
 
@@ -350,3 +352,81 @@ def margin_metrics(
     loops = loops_under_test(block, ready.own, task.asked.certificate, order=order, observer=observer)
     found = crossing_values(crossings(loops, overall=True)) if loops else {}
     return {name: worst(name, values) for name, (values, _) in found.items() if name.startswith("axes.")}
+
+
+def loop_curves(
+    task: Task, ready: Ready, block: Block, order: str, observer: Block | None = None
+) -> dict[str, list[float]]:
+    """Return curves of the steps and circles over all simulation models and payloads; empty if a loop diverges.
+
+    `low`, `high`: ends of the stepped output over all plants, in its display unit. `value`, `set_point_1`, ..: of the
+    last plant with its heaviest payload. `circle_low`, `circle_high`, `circle`: radius of the last turn at
+    `circle_angles`.
+    """
+    steps, circles = [], []
+    along = min((case.orientation for case in ready.all), key=abs)
+    try:
+        for case in ready.all:
+            plain = not (case.noise or case.late) and case.part == 1.0 and case.orientation == along
+            if case.circle or plain:
+                result = run_loop(loop_of(case, ready.own[case.plant], block, order, task, observer), compiled=True)
+                (circles if case.circle else steps).append(result)
+    except DataError:
+        return {}
+    shown, time = task.asked.certificate.scale.shown, curve_times(task)
+    name = task.robot.outputs.names[0]
+    reference = steps[-1][f"{name}_reference"]
+    after = [result.time - result.time[np.argmax(result[f"{name}_reference"] != result[f"{name}_reference"][0])]
+             for result in steps]  # fmt: skip
+    y = np.array([np.interp(time, t, shown(result.angle(name))) for t, result in zip(after, steps, strict=True)])
+    P = np.column_stack([steps[-1][motor] for motor in task.robot.set_points])
+    # A set-point is held until the next sample.
+    rows = np.clip(np.searchsorted(after[-1], time + 1e-9, side="right") - 1, 0, len(P) - 1)
+    found = _step_curves(task, ready, y, P[rows]) | {"reference": [_rounded(shown(reference[-1]))]}
+    if circles:
+        r = np.array([_radius(result, task) for result in circles])
+        found |= {"circle_low": r.min(axis=0), "circle_high": r.max(axis=0), "circle": r[-1]}
+    return _finite_curves(found)
+
+
+def linear_curves(task: Task, ready: Ready, controller: Any) -> dict[str, list[float]]:
+    """Return curves of the steps of the first output over the linear plants, as `loop_curves` does; no circle."""
+    judged_one: ControllerUnderTest = controller_under_test(controller, order=None, observer=False)
+    test = replace(task.asked.certificate.step_test(task.seed), noise=0.0, load=0.0)
+    found = run_steps(
+        ready.plants.later(judged_one.extra), judged_one.block, test, workers=1, robot=task.robot, weights=ready.weights
+    )
+    shown, time = task.asked.certificate.scale.shown, curve_times(task)
+    half = found.time.size // 2
+    # The nominal plant, the first, is moved to the end.
+    y = np.array([np.interp(time, found.time[:half], each[:half]) for each in found.angles[0, ::-1]])
+    rows = np.minimum(np.searchsorted(found.time[:half], time + 1e-9, side="right") - 1, half - 1)
+    curves = _step_curves(task, ready, shown(y), found.motors[0, 0, rows])
+    return _finite_curves(curves | {"reference": [_rounded(float(shown(test.step)))]})
+
+
+def _step_curves(task: Task, ready: Ready, y: np.ndarray, P: np.ndarray) -> dict[str, Any]:
+    """Return the curves of outputs `y` (plants, n) and of set-points `P` (n, motors) over the last plant."""
+    unit = to_si(task.robot.motors.unit)[0]
+    T, inverse = task.robot.redefinition(ready.weights)
+    found = {"low": y.min(axis=0), "high": y.max(axis=0), "value": y[-1]}
+    found |= {f"set_point_{j}": values / unit for j, values in enumerate(P.T, start=1)}
+    return found | ({"tautness": P @ T[-1] / unit} if inverse[:, -1].any() else {})
+
+
+def _radius(result: LoopResult, task: Task) -> Vector:
+    """Return the radius of the last turn at `circle_angles`, in the display unit."""
+    turn = round(2.0 * math.pi / task.asked.track["circle_rad_s"] / result.sample_time)
+    x, y = (task.asked.certificate.scale.shown(result.angle(name)[-turn:]) for name in task.robot.outputs.names)
+    return np.interp(circle_angles(), np.arctan2(y, x), np.hypot(x, y), period=2.0 * math.pi)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+def _finite_curves(found: Mapping[str, Any]) -> dict[str, list[float]]:
+    """Return curves in four digits; none if a number overflowed."""
+    if not all(np.isfinite(values).all() for values in found.values()):
+        return {}
+    return {name: [_rounded(float(value)) for value in values] for name, values in found.items()}

@@ -50,7 +50,7 @@ class Candidate:
     """One kind with its settings and its metrics.
 
     `kind`: of controller. `settings`: of its design. `x`: its point in the cube. `level`: of its last judgement, or "".
-    `metrics`: of all levels. `error`: why it has none.
+    `metrics`: of all levels. `error`: why it has none. `curves`: of its last judgement that has some.
     """
 
     kind: str
@@ -59,6 +59,7 @@ class Candidate:
     level: str = ""
     metrics: dict[str, float] = field(default_factory=dict)
     error: str = ""
+    curves: Mapping[str, list[float]] = field(default_factory=dict)
 
     def update(self, level: str, judgement: Judgement) -> None:
         """Add the judgement of a level."""
@@ -66,6 +67,7 @@ class Candidate:
         if judgement.error:
             return
         self.level = level
+        self.curves = judgement.curves or self.curves
         # The smaller of the margins by linear methods and by experiment counts.
         self.metrics |= {
             name: min(value, self.metrics.get(name, math.inf)) if name in MARGINS else value

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from softneck.core import (
     MOST_JSON,
     FileFormatError,
     OutputFileError,
+    Vector,
     atomic_write,
     resolve,
     settings_text,
@@ -101,15 +102,31 @@ class Task:
 class Judgement:
     """Result of a candidate at one level.
 
-    `metrics`: name -> value; inf where a level is never reached. `error`: why there are no metrics, or "".
+    `metrics`: name -> value; inf where a level is never reached. `error`: why there are no metrics, or "". `curves`:
+    name -> values of its step and circle for a page, at the times of `curve_times`; empty for most levels.
     """
 
     metrics: Mapping[str, float]
     error: str = ""
+    curves: Mapping[str, list[float]] = field(default_factory=dict)
 
 
 FILE = "evaluations.json"
 _LOG_FORMAT = 1
+# Samples of a curve, denser at the start of a step, and angles of a circle.
+_CURVE_SAMPLES, _CIRCLE_SAMPLES = 80, 49
+
+
+def curve_times(task: Task) -> Vector:
+    """Return the times after a step [s] at which curves are kept, denser at the start; shape (n,)."""
+    certificate = task.asked.certificate
+    duration = float((certificate.sim if task.own else certificate.step)["duration_s"])
+    return duration * np.linspace(0.0, 1.0, _CURVE_SAMPLES) ** 2
+
+
+def circle_angles() -> Vector:
+    """Return the angles [rad] at which the radius of a circle is kept; shape (n,)."""
+    return np.linspace(-math.pi, math.pi, _CIRCLE_SAMPLES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,10 +158,11 @@ class Log:
         content = _read(folder / FILE)
         if content.get("digest") == digest:
             for row in content["evaluations"]:
-                if row["error"]:
-                    continue  # try it again: a later softneck may succeed
+                if row["error"] or "curves" not in row:
+                    continue  # try it again: a later softneck may succeed, and earlier ones kept no curves
                 self.found[Job(row["kind"], row["settings"], row["level"])] = Judgement(
-                    {name: math.inf if value is None else float(value) for name, value in row["metrics"].items()}
+                    {name: math.inf if value is None else float(value) for name, value in row["metrics"].items()},
+                    curves={name: [float(value) for value in values] for name, values in row["curves"].items()},
                 )
         elif not force:
             raise OutputFileError(
@@ -158,10 +176,12 @@ class Log:
             return
         rows = [
             {"kind": job.kind, "settings": job.settings, "level": job.level, "error": item.error,
-             "metrics": {name: value if math.isfinite(value) else None for name, value in item.metrics.items()}}
+             "metrics": {name: value if math.isfinite(value) else None for name, value in item.metrics.items()},
+             "curves": dict(item.curves)}
             for job, item in self.found.items()
         ]  # fmt: skip
-        text = json.dumps({"format": _LOG_FORMAT, "digest": self._digest, "evaluations": rows}, indent=1)
+        told = json.dumps({"format": _LOG_FORMAT, "digest": self._digest})
+        text = told[:-1] + ', "evaluations": [\n' + ",\n".join(map(json.dumps, rows)) + "\n]}"
         with atomic_write(self.folder / FILE, force=True) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
 

@@ -16,7 +16,6 @@ from softneck.core import (
     Progress,
     SettingsError,
     SoftneckError,
-    Vector,
     one_blas_thread,
     require_whole,
     shown_progress,
@@ -25,7 +24,6 @@ from softneck.core import (
 from softneck.cosim import open_workers, pareto_rows
 from softneck.estimation import KalmanSettings, directions_of, robot_of
 from softneck.identification import payloads
-from softneck.loop import run_loop
 from softneck.robot import Robot, Scaling, load_for_robot
 from softneck.signals import require_same_robot
 from softneck.verification import (
@@ -39,13 +37,12 @@ from softneck.verification import (
     judge_loop,
     named_plants,
     round_12_digits,
-    run_steps,
     sources_of,
     verify,
     with_robot,
 )
 
-from ._judge import LEVELS, Case, design_candidate, loop_of, make_observer, prepare, told_conditions
+from ._judge import LEVELS, design_candidate, loop_of, make_observer, prepare, told_conditions
 from ._requirements import (
     USUAL_RISE,
     TuneRequirements,
@@ -459,30 +456,6 @@ def _round_up(value: float) -> float:
         return math.inf
     step = 10.0 ** (math.floor(math.log10(_RELAXATION_MARGIN * value)) - 1)
     return round_12_digits(math.ceil(_RELAXATION_MARGIN * value / step - 1e-9) * step)
-
-
-def step_response(task: Task, item: Candidate) -> tuple[Vector, Vector, Vector]:
-    """Return time [s], output and reference (n,) of a step of the first output, in its display unit.
-
-    The plant is the last simulation model with the heaviest payload, or the nominal linear plant.
-    """
-    ready = prepare(task)
-    controller = design_candidate(task, ready, item.kind, item.settings)
-    block, order = controller.block(), str(getattr(controller, "order", "sequential"))
-    name, asked = task.robot.outputs.names[0], task.asked.certificate
-    shown = asked.scale.shown
-    if not ready.own:
-        test = replace(asked.step_test(task.seed), noise=0.0, load=0.0)
-        found = run_steps(ready.plants.take(0), block, test, workers=1, robot=task.robot, weights=ready.weights)
-        half = found.time.size // 2
-        return found.time[:half], shown(found.angles[0, 0, :half]), np.full(half, shown(test.step))
-    case = Case(len(ready.own) - 1, max(map(float, ready.own[-1].payloads(asked.sim["payloads_kg"]))))
-    result = run_loop(
-        loop_of(case, ready.own[case.plant], block, order, task, make_observer(task, item.kind)), compiled=True
-    )
-    reference = result[f"{name}_reference"]
-    first = max(0, int(np.argmax(reference != reference[0])) - round(0.1 / result.sample_time))
-    return result.time[first:] - result.time[first], shown(result.angle(name)[first:]), shown(reference[first:])
 
 
 def holds_with_observer(task: Task, item: Candidate, observer: Any, bounds: tuple[Requirement, ...]) -> bool:

@@ -61,7 +61,7 @@ def test_the_folder_holds_what_belongs_to_the_best(
     assert values["evaluations"] == 2
     assert all(row.keys() >= {"kind", "settings", "metrics"} for row in values["pareto"])
     assert {path.name for path in folder.iterdir()} >= {
-        "best.npz", "observer.npz", "best.certificate.json", "loop.toml", "pareto.csv", "report.html"
+        "best.npz", "observer.npz", "best.certificate.json", "loop.toml", "pareto.csv", "report.html", "tuner.html"
     }  # fmt: skip
     assert len((folder / "pareto.csv").read_text().splitlines()) == 1 + len(values["pareto"])
     # What the certificate says `verify` says too, with the requirements that are left there.

@@ -130,7 +130,7 @@ def test_a_log_gives_back_what_was_judged_and_has_refusals_tried_again(tmp_path:
 
     log = Log(tmp_path, "d")
     job = Job.of("pi", {"b": 1.25, "a": 1e-17 + 0.1}, "all")
-    log.found[job] = Judgement({"x": 1.0 / 3.0, "y": float("inf")})
+    log.found[job] = Judgement({"x": 1.0 / 3.0, "y": float("inf")}, curves={"value": [0.0, 0.1]})
     refused = Job.of("pi", {}, "all")
     log.found[refused] = Judgement({}, "no plant")
     log.write()
