@@ -91,14 +91,20 @@ class Tuner {
     at("command").textContent = one.command;
     this.draw(one);
   }
+  // Curves share sources: each is replaced once, by `draw`.
   set(panel, name, columns) {
     const found = this.plots[panel].renderers.find(one => one.name === name);
     if (!found) return;
-    const { glyph, data_source } = found, data = { ...data_source.data };
-    for (const [key, values] of Object.entries(columns)) data[glyph[key].field] = values;
-    data_source.data = data;
+    const { glyph, data_source } = found;
+    if (!this.pending.has(data_source)) this.pending.set(data_source, { ...data_source.data });
+    for (const [key, values] of Object.entries(columns)) this.pending.get(data_source)[glyph[key].field] = values;
   }
   draw(one) {
+    this.pending = new Map();
+    this.fill(one);
+    for (const [source, data] of this.pending) source.data = data;
+  }
+  fill(one) {
     const { panels, names } = this, curves = one.curves, time = this.time;
     const good = this.candidates.map(each => !this.broken(each).length);
     const column = keep => this.candidates.map((each, k) => keep(each, k) ? each.y : NaN);
