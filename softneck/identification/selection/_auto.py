@@ -131,14 +131,14 @@ def _progress_text(kind: str, tried: list[KindTrial]) -> str:
 
 def _explain_choice(chosen: KindTrial, alike: list[KindTrial]) -> str:
     """Return why a kind is taken before those that are alike."""
-    said = f"{chosen.kind} runs free with {chosen.fit:.1f} % at its worst ({chosen.worst})"
-    if not alike:
-        return f"{said}, better than all others at theirs."
-    others = ", ".join(f"{one.kind} {one.fit:.1f} % with {one.numbers} numbers" for one in alike)
-    return (
-        f"{said}; {others} are not worse by more than {ALIKE:g} points, and of such kinds the one of the fewest "
-        f"numbers is taken ({chosen.numbers})."
+    said = (
+        f"Chosen: {chosen.kind}. Worst simulation fit {chosen.fit:.1f} % ({chosen.worst}), "
+        f"{chosen.numbers:,} parameters."
     )
+    if not alike:
+        return f"{said} The worst fit of every other kind is lower."
+    others = "; ".join(f"{one.kind} reaches {one.fit:.1f} % with {one.numbers:,}" for one in alike)
+    return f"{said} {others}. Within {ALIKE:g} points the kind with the fewest parameters is chosen."
 
 
 def _explain_guarded(best: KindTrial, chosen: KindTrial) -> str:

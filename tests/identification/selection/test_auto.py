@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -16,6 +19,7 @@ from softneck.identification.selection._auto import (
     EXAM,
     HOLD_OUT,
     KindTrial,
+    _explain_choice,
     _explain_guarded,
     _Race,
     best_others,
@@ -44,7 +48,7 @@ def test_the_ranking_is_by_free_run_and_the_simplest_of_those_alike_is_chosen(ch
     # The recording is that of a linear neck: nothing is much better than `rls`, and nothing has fewer numbers.
     assert choice.chosen.kind == "rls"
     assert choice.chosen.fit > fits[0] - ALIKE
-    assert "fewest numbers" in choice.why or choice.ranking[0] is choice.chosen
+    assert "fewest parameters" in choice.why or choice.ranking[0] is choice.chosen
 
 
 @pytest.mark.slow
@@ -279,3 +283,15 @@ def test_a_guarded_form_that_cannot_be_trained_is_listed_with_its_reason(
     monkeypatch.setattr(Guarded, "fit", fit)
     assert race.guard_best(race.tried["play"], silent) is race.tried["play"]
     assert race.tried["guarded"].failure == "there is no base to fall back to"
+
+
+def test_the_choice_says_fit_and_size_of_the_chosen_and_of_those_alike() -> None:
+    chosen, other = (SimpleNamespace(kind=kind, fit=fit, worst="largest motions", numbers=numbers)
+                     for kind, fit, numbers in (("play", 69.04, 38), ("ensemble", 69.4, 10_481)))  # fmt: skip
+    said = "Chosen: play. Worst simulation fit 69.0 % (largest motions), 38 parameters."
+    alone: Any = chosen
+    assert _explain_choice(alone, []) == f"{said} The worst fit of every other kind is lower."
+    beside: Any = [other]
+    assert _explain_choice(alone, beside) == (
+        f"{said} ensemble reaches 69.4 % with 10,481. Within 0.5 points the kind with the fewest parameters is chosen."
+    )
