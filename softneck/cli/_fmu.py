@@ -59,7 +59,9 @@ def command(
     backend: str | None, fmi: str, platforms: tuple[str, ...], sensitivities: bool, robot: str | None, force: bool,
     as_json: bool,
 ) -> None:  # fmt: skip
-    """Package FILE as a Co-Simulation FMU of FMI 2.0 or 3.0; of several files, or of a folder, -o is a folder.
+    """Package FILE as an FMU of FMI 2.0 or 3.0; of several files, or of a folder, -o is a folder.
+
+    It is for Co-Simulation; with --backend compiled also for Model Exchange, with an event at each sample.
 
     FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab, rough,
     trunk), a robot file or preset, whose virtual plant it becomes, or a loop file, from whose [reference] a reference

@@ -221,6 +221,7 @@ def _fmu(file: Path) -> dict[str, Any]:
         "type": "FMU",
         "model": description.modelName,
         "fmi_version": description.fmiVersion,
+        "interfaces": ", ".join(cosim.interfaces_of(description)),
         "description": description.description or "",
         "tool": description.generationTool or "",
         **by_causality,

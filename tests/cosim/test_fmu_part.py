@@ -119,7 +119,7 @@ def _description(old: bytes, new: bytes) -> Callable[[str, bytes], tuple[str, by
     ("old", "new", "error", "message"),
     [
         (b'fmiVersion="2.0"', b'fmiVersion="1.0"', FileFormatError, "is an FMI 1.0 FMU|cannot be read"),
-        (b"<CoSimulation ", b"<ModelExchange ", FileFormatError, "Model Exchange only"),
+        (b"<CoSimulation ", b"<ScheduledExecution ", FileFormatError, "is for no interface only; export it for Co-"),
         (b"<ModelVariables>", b"<ModelVariables", FileFormatError, "cannot be read"),
         (b' stepSize="0.02"', b"", SettingsError, "states no step size"),
         (b' stepSize="0.02"', b' stepSize="0. 02"', FileFormatError, "`0. 02` where a number is needed"),

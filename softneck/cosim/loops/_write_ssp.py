@@ -182,7 +182,9 @@ def block_without_python(path: Path) -> Block | None:
         if block is not None:
             return block
         experiment = description.model.coSimulation
-        if experiment is not None and experiment.needsExecutionTool:
+        if experiment is None:
+            raise SettingsError(f"{path}: is for Model Exchange only; masters of SSP files step Co-Simulation FMUs.")
+        if experiment.needsExecutionTool:
             raise SettingsError(
                 f"{path}: needs another program to run (needsExecutionTool), and so would the SSP file; "
                 "use a softneck file instead, or `--backend python`."

@@ -39,7 +39,7 @@ class FmuError(SoftneckError):
 
 
 class FmuPart:
-    """An FMI 2.0 or 3.0 Co-Simulation FMU as a `softneck.loop.Part`.
+    """An FMI 2.0 or 3.0 FMU as a `softneck.loop.Part`: Co-Simulation, or Model Exchange without continuous states.
 
     Attributes:
         path: of the FMU.
@@ -71,7 +71,7 @@ class FmuPart:
             units: our name -> unit, for FMUs that state none or a wrong one.
 
         Raises:
-            FileFormatError: no FMI 2.0 or 3.0 Co-Simulation FMU for this platform.
+            FileFormatError: no such FMU for this platform.
             SettingsError: neither FMU nor caller states role or sample time.
         """
         self.path = Path(path)
@@ -137,9 +137,20 @@ class FmuPart:
         try:
             self._inputs.write(inputs)
             native.step(time, self.sample_time)
+            if native.exchange:
+                return self._reach(native, time + self.sample_time)
             return self._outputs.read()
         except CallError as error:
             raise self._call_error(f"in the step from t = {time:g} s", error) from error
+
+    def _reach(self, native: Native, time: float) -> Vector:
+        """Enter the event at `time` [s]; return a plant's outputs there, and those before it of any other part."""
+        if self.role == "plant":
+            native.reach(time)
+            return self._outputs.read()
+        outputs = self._outputs.read()
+        native.reach(time)
+        return outputs
 
     def close(self) -> None:
         """Terminate the FMU, free it and remove its unpacked files."""
@@ -159,8 +170,8 @@ class FmuPart:
         Raises:
             SettingsError: the FMU cannot serialise its state.
         """
-        experiment: Any = self._description.model.coSimulation
-        if not (experiment.canGetAndSetFMUstate and experiment.canSerializeFMUstate) or self._native is None:
+        interface = self._description.interface
+        if not (interface.canGetAndSetFMUstate and interface.canSerializeFMUstate) or self._native is None:
             raise SettingsError(f"{self.path}: cannot save its state; its canSerializeFMUstate is false.")
         return self._call("its state", self._native.get_state)
 

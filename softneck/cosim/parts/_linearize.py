@@ -111,7 +111,7 @@ def linearize(
     reachable or not observable are left out.
 
     Args:
-        source: file of a model, observer, controller or neck; an FMU of any tool (FMI 2.0 or 3.0, Co-Simulation); a
+        source: file of a model, observer, controller or neck; an FMU of any tool that `FmuPart` runs; a
             preset of a neck; a model, observer or controller; or its block.
         at: [s], a multiple of the sample time.
         values: inputs and parameters that differ from their start values, in SI units.

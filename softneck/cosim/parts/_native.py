@@ -1,8 +1,9 @@
-"""The C calls of a Co-Simulation FMU, for FMI 2.0 and FMI 3.0; fmpy only loads and instantiates."""
+"""The C calls of an FMU, for FMI 2.0 and FMI 3.0; fmpy only loads and instantiates."""
 
 from __future__ import annotations
 
 import ctypes
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 OK_OR_WARNING, ERROR, FATAL = 1, 3, 4
 _STATUS_TEXTS = ("OK", "a warning", "discard", "an error", "a fatal error", "pending")
 Log = Callable[[int, str], None]
+_MOST_ITERATIONS = 100  # of one event
+_SAME_TIME = 1e-6  # share of a step: times of events are sums of decimals
 # fmpy changes the working directory while it loads a library, so only one thread may load at a time.
 _LOADING = threading.Lock()
 
@@ -39,18 +42,22 @@ class Native:
 
     def __init__(self, description: Description, folder: Path, log: Log) -> None:
         """Load the library in `folder`; errors are those of fmpy."""
-        from fmpy.fmi2 import FMU2Slave
-        from fmpy.fmi3 import FMU3Slave
+        from fmpy.fmi2 import FMU2Model, FMU2Slave
+        from fmpy.fmi3 import FMU3Model, FMU3Slave
 
         self.version = description.version
+        self.exchange = description.model.coSimulation is None
+        self._notify = self.exchange and bool(description.interface.needsCompletedIntegratorStep)
+        self._next_event = math.inf
         common = {
             "guid": description.model.guid,
             "unzipDirectory": str(folder),
             "modelIdentifier": description.identifier,
             "instanceName": description.path.stem,
         }
+        classes = {2: (FMU2Slave, FMU2Model), 3: (FMU3Slave, FMU3Model)}
         with _LOADING:
-            self.fmu: Any = FMU2Slave(**common) if self.version == 2 else FMU3Slave(**common)
+            self.fmu: Any = classes[self.version][self.exchange](**common)
         self._log = log
         self._step: Callable[..., int] | None = None
         self._step_rest: tuple[Any, ...] = ()
@@ -80,6 +87,8 @@ class Native:
         self._log(status, " ".join((message or b"").decode("utf-8", "replace").replace("%%", "%").split()))
 
     def _step_call(self) -> tuple[Callable[..., int], tuple[Any, ...]]:
+        if self.exchange:
+            return self._step_over_events, ()
         if self.version == 2:
             types = [ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_int]
             return self.function("fmi2DoStep", types), (1,)
@@ -112,6 +121,43 @@ class Native:
         status = self._step(self.fmu.component, time, size, *self._step_rest)  # pyright: ignore[reportOptionalCall]
         if status > OK_OR_WARNING:
             raise CallError(f"fmi{self.version}DoStep", status)
+
+    def _step_over_events(self, _component: Any, time: float, size: float) -> int:
+        """Finish the event at `time` and handle those before its end; Model Exchange without continuous states."""
+        end = time + size * (1.0 - _SAME_TIME)
+        self._update()
+        while self._next_event < end:
+            self.reach(self._next_event)
+            self._update()
+        return 0
+
+    def reach(self, time: float) -> None:
+        """Enter the event at `time` [s], where the next inputs are set."""
+        self._ask(self.fmu.setTime, time)
+        if self._notify:
+            self._ask(self.fmu.completedIntegratorStep)
+        self._ask(self.fmu.enterEventMode)
+
+    def _update(self) -> None:
+        """Update discrete states until the FMU needs no more, and leave event mode."""
+        update = self.fmu.newDiscreteStates if self.version == 2 else self.fmu.updateDiscreteStates
+        for _ in range(_MOST_ITERATIONS):
+            again, ended, _, _, defined, time = self._ask(update)
+            if ended:
+                raise CallError("its event asked to end the simulation; it", ERROR)
+            if not again:
+                self._next_event = time if defined else math.inf
+                self._ask(self.fmu.enterContinuousTimeMode)
+                return
+        raise CallError(f"its discrete states do not settle in {_MOST_ITERATIONS} iterations; the event", ERROR)
+
+    def _ask(self, call: Callable[..., Any], *arguments: Any) -> Any:
+        from fmpy.fmi1 import FMICallException
+
+        try:
+            return call(*arguments)
+        except FMICallException as error:
+            raise CallError(error.function, error.status) from error
 
     def release(self, *, broken: bool, is_softneck: bool) -> None:
         """Terminate and free the instance as far as FMI allows."""

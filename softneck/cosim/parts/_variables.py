@@ -75,8 +75,12 @@ class Description:
     @property
     def identifier(self) -> str:
         """Return the name of the FMU's binary."""
-        experiment = self.model.coSimulation
-        return (experiment.modelIdentifier or "") if experiment is not None else ""
+        return (self.interface.modelIdentifier or "") if self.interface is not None else ""
+
+    @property
+    def interface(self) -> Any:
+        """Return the interface that softneck runs: Co-Simulation if there is one, else Model Exchange."""
+        return self.model.coSimulation if self.model.coSimulation is not None else self.model.modelExchange
 
     def ports(self, causality: str) -> tuple[Port, ...]:
         """Return the ports of one causality ("input", "output", "parameter") in the FMU's order."""
@@ -107,7 +111,8 @@ def read_description(
     """Read the description of the FMU `path`, unpacked in `folder`.
 
     `names` (the FMU's variable name -> ours) and `units` (our name -> unit) are as in `FmuPart`. Raises
-    FileFormatError: no valid FMI 2.0 or 3.0 Co-Simulation FMU, or it lacks a variable of `names`.
+    FileFormatError: no valid FMU of FMI 2.0 or 3.0, only with interfaces that need a solver or a scheduler, or without
+    a variable of `names`.
     """
     import fmpy
 
@@ -119,7 +124,7 @@ def read_description(
     if version is None:
         raise FileFormatError(f"{path}: is an FMI {model.fmiVersion} FMU; softneck runs FMI 2.0 and 3.0.")
     if model.coSimulation is None:
-        raise FileFormatError(f"{path}: is for Model Exchange only; a Co-Simulation FMU is needed.")
+        _check_exchange(path, model)
     known = {variable.name for variable in model.modelVariables}
     absent = sorted(set(names) - known)
     if absent:
@@ -139,6 +144,29 @@ def read_description(
     except ET.ParseError as error:  # fmpy's parser accepts more than Python's
         raise FileFormatError(f"{path}: its modelDescription.xml cannot be read ({error}).") from error
     return Description(path, model, annotation, variables, version, units or {})
+
+
+def interfaces_of(model: ModelDescription) -> list[str]:
+    """Return the interfaces of an FMU by their names in FMI."""
+    found = {
+        "Model Exchange": model.modelExchange,
+        "Co-Simulation": model.coSimulation,
+        "Scheduled Execution": getattr(model, "scheduledExecution", None),
+    }
+    return [name for name, interface in found.items() if interface is not None]
+
+
+def _check_exchange(path: Path, model: ModelDescription) -> None:
+    """Refuse what needs a solver: softneck runs Model Exchange FMUs whose only dynamics are events at known times."""
+    if model.modelExchange is None:
+        only = ", ".join(interfaces_of(model)) or "no interface"
+        raise FileFormatError(f"{path}: is for {only} only; export it for Co-Simulation.")
+    states, zeros = int(model.numberOfContinuousStates or 0), int(model.numberOfEventIndicators or 0)
+    if states or zeros:
+        what = f"{states} continuous states" if states else f"{zeros} event indicators"
+        raise FileFormatError(
+            f"{path}: is for Model Exchange only and has {what}, which need a solver; export it for Co-Simulation."
+        )
 
 
 def _annotation(folder: Path) -> Annotation:

@@ -43,9 +43,10 @@ def build_compiled_fmu(
     thing: Buildable | Block | str | Path, path: str | Path, *, info: FmuInfo | None = None, force: bool = False,
     fmi: int = 2, platforms: Sequence[str] = (), sensitivities: bool = False,
 ) -> str:  # fmt: skip
-    """Write `thing` as a Co-Simulation FMU that needs no Python; return one line on the origin of its libraries.
+    """Write `thing` as an FMU that needs no Python; return one line on the origin of its libraries.
 
-    Variables, timing and state are those of `build_fmu`. The same block, info and libraries give the same bytes.
+    It has Co-Simulation and Model Exchange. Variables, timing and state are those of `build_fmu`. The same block, info
+    and libraries give the same bytes.
 
     Args:
         thing: as for `build_fmu`.

@@ -124,7 +124,7 @@ def model_description(block: Block, info: FmuInfo, identity: Identity, *, fmi: i
     """
     _check_names(block, _TIME_NAME if fmi == 3 else "")
     root = Element("fmiModelDescription", _head(block, info, identity, fmi))
-    _co_simulation(root, block, identity, fmi)
+    _interfaces(root, block, identity, fmi)
     _unit_definitions(root, block)
     categories = SubElement(root, "LogCategories")
     told = (("logStatusWarning", "Warnings"), ("logStatusError", "Errors"), ("logAll", "Everything"))
@@ -179,21 +179,25 @@ def _head(block: Block, info: FmuInfo, identity: Identity, fmi: int) -> dict[str
     return head | {name: text for name, text in texts.items() if text}
 
 
-def _co_simulation(root: Element, block: Block, identity: Identity, fmi: int) -> None:
-    yes = ["canHandleVariableCommunicationStepSize"] + ["canNotUseMemoryManagementFunctions"] * (fmi == 2)
+def _interfaces(root: Element, block: Block, identity: Identity, fmi: int) -> None:
+    """Declare Co-Simulation, and Model Exchange of compiled FMUs: one binary has both."""
     state = "FMUstate" if fmi == 2 else "FMUState"
-    yes += [f"canGetAndSet{state}", f"canSerialize{state}"]
+    yes = [f"canGetAndSet{state}", f"canSerialize{state}"] + ["canNotUseMemoryManagementFunctions"] * (fmi == 2)
     yes += ["providesDirectionalDerivative" + "s" * (fmi == 3)] * bool(identity.ahead)
-    attributes = {"modelIdentifier": identity.name}
+    common = {"modelIdentifier": identity.name} | dict.fromkeys(yes, "true")
+    no_call = {"completedIntegratorStepNotNeeded": "true"} if fmi == 2 else {"needsCompletedIntegratorStep": "false"}
+    own = {"canHandleVariableCommunicationStepSize": "true"}
     if fmi == 3:
-        attributes["fixedInternalStepSize"] = repr(float(block.sample_time))
+        own["fixedInternalStepSize"] = repr(float(block.sample_time))
     elif not identity.sources:
-        attributes["needsExecutionTool"] = "true"  # the Python of the host
-    element = SubElement(root, "CoSimulation", attributes | dict.fromkeys(yes, "true"))
-    if identity.sources and fmi == 2:
-        files = SubElement(element, "SourceFiles")
-        for name in identity.sources:
-            SubElement(files, "File", name=name)
+        own["needsExecutionTool"] = "true"  # the Python of the host
+    interfaces = {"ModelExchange": no_call} if identity.sources else {}
+    for name, attributes in (interfaces | {"CoSimulation": own}).items():
+        element = SubElement(root, name, common | attributes)
+        if identity.sources and fmi == 2:
+            files = SubElement(element, "SourceFiles")
+            for file in identity.sources:
+                SubElement(files, "File", name=file)
 
 
 def _unit_definitions(root: Element, block: Block) -> None:

@@ -1,4 +1,5 @@
-/* FMI 2.0.4: Co-Simulation over `sn_instance`, and refusals of all else, which strict loaders want to find. */
+/* FMI 2.0.4: Co-Simulation and Model Exchange over `sn_instance`, and refusals of all else, which strict loaders want to
+ * find. */
 #ifndef SN_FMI2_H
 #define SN_FMI2_H
 
@@ -57,8 +58,16 @@ static void sn_tell2(void *self, int status, const char *text)
 static fmi2Status sn_refused2(fmi2Component c, const char *what)
 {
     if (c != NULL)
-        sn_say((sn_instance *)c, SN_FAIL, "%s is not part of this Co-Simulation FMU.", what);
+        sn_say((sn_instance *)c, SN_FAIL, "%s is not part of this FMU.", what);
     return fmi2Error;
+}
+
+/* Whether it is an instance for Model Exchange. */
+static int sn_exchanges2(fmi2Component c, const char *what)
+{
+    if (c != NULL && !((sn_instance *)c)->exchange)
+        sn_say((sn_instance *)c, SN_FAIL, "%s is of Model Exchange; this is an instance for Co-Simulation.", what);
+    return c != NULL && ((sn_instance *)c)->exchange;
 }
 
 SN_EXPORT const char *fmi2GetTypesPlatform(void) { return "default"; }
@@ -78,15 +87,14 @@ SN_EXPORT fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2Stri
     (void)visible, (void)on;
     if (functions != NULL)
         logger.function = functions->logger;
-    if (type != fmi2CoSimulation || location == NULL || !sn_path_of(location, path, sizeof path)) {
+    if (location == NULL || !sn_path_of(location, path, sizeof path)) {
         if (logger.data != NULL)
             logger.function(functions->componentEnvironment, name != NULL ? name : "", fmi2Error, "logStatusError",
-                            type != fmi2CoSimulation ? "softneck: this FMU is for Co-Simulation only."
-                                                     : "softneck: the host gives no usable location of the resources.");
+                            "softneck: the host gives no usable location of the resources.");
         return NULL;
     }
-    return sn_instantiate(path, guid, name, sn_tell2, functions != NULL ? functions->componentEnvironment : NULL,
-                          logger.data);
+    return sn_instantiate(type == fmi2ModelExchange, path, guid, name, sn_tell2,
+                          functions != NULL ? functions->componentEnvironment : NULL, logger.data);
 }
 
 SN_EXPORT void fmi2FreeInstance(fmi2Component c) { sn_free_instance((sn_instance *)c); }
@@ -285,16 +293,57 @@ SN_REFUSE2(fmi2SetRealInputDerivatives,
 SN_REFUSE2(fmi2GetRealOutputDerivatives,
            (fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], fmi2Real value[]),
            ((void)vr, (void)n, (void)order, (void)value))
-SN_REFUSE2(fmi2EnterEventMode, (fmi2Component c), (void)c)
-SN_REFUSE2(fmi2NewDiscreteStates, (fmi2Component c, fmi2EventInfo *info), (void)info)
-SN_REFUSE2(fmi2EnterContinuousTimeMode, (fmi2Component c), (void)c)
-SN_REFUSE2(fmi2CompletedIntegratorStep, (fmi2Component c, fmi2Boolean no, fmi2Boolean *event, fmi2Boolean *stop),
-           ((void)no, (void)event, (void)stop))
-SN_REFUSE2(fmi2SetTime, (fmi2Component c, fmi2Real time), (void)time)
-SN_REFUSE2(fmi2SetContinuousStates, (fmi2Component c, const fmi2Real x[], size_t n), ((void)x, (void)n))
-SN_REFUSE2(fmi2GetDerivatives, (fmi2Component c, fmi2Real x[], size_t n), ((void)x, (void)n))
-SN_REFUSE2(fmi2GetEventIndicators, (fmi2Component c, fmi2Real x[], size_t n), ((void)x, (void)n))
-SN_REFUSE2(fmi2GetContinuousStates, (fmi2Component c, fmi2Real x[], size_t n), ((void)x, (void)n))
-SN_REFUSE2(fmi2GetNominalsOfContinuousStates, (fmi2Component c, fmi2Real x[], size_t n), ((void)x, (void)n))
+
+/* Model Exchange: events, and no continuous states. */
+SN_EXPORT fmi2Status fmi2EnterEventMode(fmi2Component c)
+{
+    return sn_exchanges2(c, "fmi2EnterEventMode") && sn_enter_event((sn_instance *)c) ? fmi2OK : fmi2Error;
+}
+
+SN_EXPORT fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *info)
+{
+    fmi2EventInfo found = {0, 0, 0, 0, 1, 0.0};
+    int done = sn_exchanges2(c, "fmi2NewDiscreteStates") && info != NULL &&
+               sn_update((sn_instance *)c, &found.newDiscreteStatesNeeded, &found.nextEventTime);
+    if (done)
+        *info = found;
+    return done ? fmi2OK : fmi2Error;
+}
+
+SN_EXPORT fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c)
+{
+    if (!sn_exchanges2(c, "fmi2EnterContinuousTimeMode"))
+        return fmi2Error;
+    ((sn_instance *)c)->event = 0;
+    return fmi2OK;
+}
+
+SN_EXPORT fmi2Status fmi2CompletedIntegratorStep(fmi2Component c, fmi2Boolean no, fmi2Boolean *event, fmi2Boolean *stop)
+{
+    (void)no;
+    if (!sn_exchanges2(c, "fmi2CompletedIntegratorStep"))
+        return fmi2Error;
+    *event = *stop = 0;
+    return fmi2OK;
+}
+
+SN_EXPORT fmi2Status fmi2SetTime(fmi2Component c, fmi2Real time)
+{
+    return sn_exchanges2(c, "fmi2SetTime") && sn_set_time((sn_instance *)c, time) ? fmi2OK : fmi2Error;
+}
+
+#define SN_STATELESS2(name, type)                                                                                   \
+    SN_EXPORT fmi2Status name(fmi2Component c, type x[], size_t n)                                                  \
+    {                                                                                                               \
+        (void)x;                                                                                                    \
+        if (!sn_exchanges2(c, #name))                                                                               \
+            return fmi2Error;                                                                                       \
+        return n == 0 ? fmi2OK : sn_refused2(c, "a continuous state or event indicator");                           \
+    }
+SN_STATELESS2(fmi2SetContinuousStates, const fmi2Real)
+SN_STATELESS2(fmi2GetDerivatives, fmi2Real)
+SN_STATELESS2(fmi2GetEventIndicators, fmi2Real)
+SN_STATELESS2(fmi2GetContinuousStates, fmi2Real)
+SN_STATELESS2(fmi2GetNominalsOfContinuousStates, fmi2Real)
 
 #endif

@@ -1,4 +1,5 @@
-/* FMI 3.0: Co-Simulation with scalars of Float64, Int64 and Boolean over `sn_instance`, and refusals of all else. */
+/* FMI 3.0: Co-Simulation and Model Exchange with scalars of Float64, Int64 and Boolean over `sn_instance`, and refusals of
+ * all else. */
 #ifndef SN_FMI3_H
 #define SN_FMI3_H
 
@@ -50,8 +51,16 @@ static void sn_tell3(void *self, int status, const char *text)
 static fmi3Status sn_refused3(fmi3Instance c, const char *what)
 {
     if (c != NULL)
-        sn_say((sn_instance *)c, SN_FAIL, "%s is not part of this Co-Simulation FMU.", what);
+        sn_say((sn_instance *)c, SN_FAIL, "%s is not part of this FMU.", what);
     return fmi3Error;
+}
+
+/* Whether it is an instance for Model Exchange. */
+static int sn_exchanges3(fmi3Instance c, const char *what)
+{
+    if (c != NULL && !((sn_instance *)c)->exchange)
+        sn_say((sn_instance *)c, SN_FAIL, "%s is of Model Exchange; this is an instance for Co-Simulation.", what);
+    return c != NULL && ((sn_instance *)c)->exchange;
 }
 
 SN_EXPORT const char *fmi3GetVersion(void) { return "3.0"; }
@@ -77,17 +86,23 @@ SN_EXPORT fmi3Instance fmi3InstantiateCoSimulation(
                 events ? "softneck: this FMU has no event mode." : "softneck: the host gives no path of the resources.");
         return NULL;
     }
-    return sn_instantiate(path, token, name, sn_tell3, environment, logger.data);
+    return sn_instantiate(0, path, token, name, sn_tell3, environment, logger.data);
 }
 
 SN_EXPORT fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String resources,
                                                     fmi3Boolean visible, fmi3Boolean on,
                                                     fmi3InstanceEnvironment environment, fmi3LogMessageCallback log)
 {
-    (void)name, (void)token, (void)resources, (void)visible, (void)on;
-    if (log != NULL)
-        log(environment, fmi3Error, "logStatusError", "softneck: this FMU is for Co-Simulation only.");
-    return NULL;
+    char path[3072];
+    sn_carried3 logger = {NULL};
+    (void)visible, (void)on;
+    logger.function = log;
+    if (resources == NULL || !sn_path_of(resources, path, sizeof path)) {
+        if (logger.data != NULL)
+            log(environment, fmi3Error, "logStatusError", "softneck: the host gives no path of the resources.");
+        return NULL;
+    }
+    return sn_instantiate(1, path, token, name, sn_tell3, environment, logger.data);
 }
 
 SN_EXPORT fmi3Instance fmi3InstantiateScheduledExecution(
@@ -95,8 +110,10 @@ SN_EXPORT fmi3Instance fmi3InstantiateScheduledExecution(
     fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3ClockUpdateCallback update,
     fmi3LockPreemptionCallback lock, fmi3UnlockPreemptionCallback unlock)
 {
-    (void)update, (void)lock, (void)unlock;
-    return fmi3InstantiateModelExchange(name, token, resources, visible, on, environment, log);
+    (void)name, (void)token, (void)resources, (void)visible, (void)on, (void)update, (void)lock, (void)unlock;
+    if (log != NULL)
+        log(environment, fmi3Error, "logStatusError", "softneck: this FMU has no scheduled execution.");
+    return NULL;
 }
 
 SN_EXPORT void fmi3FreeInstance(fmi3Instance c) { sn_free_instance((sn_instance *)c); }
@@ -358,10 +375,7 @@ SN_REFUSE3(fmi3GetAdjointDerivative,
            ((void)a, (void)na, (void)b, (void)nb, (void)seed, (void)ns, (void)v, (void)nv))
 SN_REFUSE3(fmi3EnterConfigurationMode, (fmi3Instance c), (void)c)
 SN_REFUSE3(fmi3ExitConfigurationMode, (fmi3Instance c), (void)c)
-SN_REFUSE3(fmi3EnterEventMode, (fmi3Instance c), (void)c)
 SN_REFUSE3(fmi3EnterStepMode, (fmi3Instance c), (void)c)
-SN_REFUSE3(fmi3EnterContinuousTimeMode, (fmi3Instance c), (void)c)
-SN_REFUSE3(fmi3EvaluateDiscreteStates, (fmi3Instance c), (void)c)
 SN_REFUSE3(fmi3GetIntervalDecimal,
            (fmi3Instance c, sn_references vr, size_t n, fmi3Float64 v[], fmi3IntervalQualifier q[]),
            ((void)vr, (void)n, (void)v, (void)q))
@@ -382,22 +396,72 @@ SN_REFUSE3(fmi3SetShiftDecimal, (fmi3Instance c, sn_references vr, size_t n, con
 SN_REFUSE3(fmi3SetShiftFraction,
            (fmi3Instance c, sn_references vr, size_t n, const fmi3UInt64 a[], const fmi3UInt64 b[]),
            ((void)vr, (void)n, (void)a, (void)b))
-SN_REFUSE3(fmi3UpdateDiscreteStates,
-           (fmi3Instance c, fmi3Boolean *a, fmi3Boolean *b, fmi3Boolean *d, fmi3Boolean *e, fmi3Boolean *f,
-            fmi3Float64 *t),
-           ((void)a, (void)b, (void)d, (void)e, (void)f, (void)t))
-SN_REFUSE3(fmi3CompletedIntegratorStep, (fmi3Instance c, fmi3Boolean no, fmi3Boolean *a, fmi3Boolean *b),
-           ((void)no, (void)a, (void)b))
-SN_REFUSE3(fmi3SetTime, (fmi3Instance c, fmi3Float64 time), (void)time)
-SN_REFUSE3(fmi3SetContinuousStates, (fmi3Instance c, const fmi3Float64 x[], size_t n), ((void)x, (void)n))
-SN_REFUSE3(fmi3GetContinuousStateDerivatives, (fmi3Instance c, fmi3Float64 x[], size_t n), ((void)x, (void)n))
-SN_REFUSE3(fmi3GetEventIndicators, (fmi3Instance c, fmi3Float64 x[], size_t n), ((void)x, (void)n))
-SN_REFUSE3(fmi3GetContinuousStates, (fmi3Instance c, fmi3Float64 x[], size_t n), ((void)x, (void)n))
-SN_REFUSE3(fmi3GetNominalsOfContinuousStates, (fmi3Instance c, fmi3Float64 x[], size_t n), ((void)x, (void)n))
 SN_REFUSE3(fmi3GetOutputDerivatives,
            (fmi3Instance c, sn_references vr, size_t n, const fmi3Int32 orders[], fmi3Float64 v[], size_t nv),
            ((void)vr, (void)n, (void)orders, (void)v, (void)nv))
 SN_REFUSE3(fmi3ActivateModelPartition, (fmi3Instance c, fmi3ValueReference clock, fmi3Float64 time),
            ((void)clock, (void)time))
+
+/* Model Exchange: events, and no continuous states. */
+SN_EXPORT fmi3Status fmi3EnterEventMode(fmi3Instance c)
+{
+    return sn_exchanges3(c, "fmi3EnterEventMode") && sn_enter_event((sn_instance *)c) ? fmi3OK : fmi3Error;
+}
+
+SN_EXPORT fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance c)
+{
+    return sn_exchanges3(c, "fmi3EvaluateDiscreteStates") ? fmi3OK : fmi3Error;
+}
+
+SN_EXPORT fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *again, fmi3Boolean *terminate,
+                                              fmi3Boolean *nominals, fmi3Boolean *states, fmi3Boolean *defined,
+                                              fmi3Float64 *next)
+{
+    int needed = 0;
+    double time = 0.0;
+    if (!sn_exchanges3(c, "fmi3UpdateDiscreteStates") || !sn_update((sn_instance *)c, &needed, &time))
+        return fmi3Error;
+    *again = needed != 0;
+    *terminate = *nominals = *states = 0;
+    *defined = 1;
+    *next = time;
+    return fmi3OK;
+}
+
+SN_EXPORT fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c)
+{
+    if (!sn_exchanges3(c, "fmi3EnterContinuousTimeMode"))
+        return fmi3Error;
+    ((sn_instance *)c)->event = 0;
+    return fmi3OK;
+}
+
+SN_EXPORT fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c, fmi3Boolean no, fmi3Boolean *event, fmi3Boolean *stop)
+{
+    (void)no;
+    if (!sn_exchanges3(c, "fmi3CompletedIntegratorStep"))
+        return fmi3Error;
+    *event = *stop = 0;
+    return fmi3OK;
+}
+
+SN_EXPORT fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time)
+{
+    return sn_exchanges3(c, "fmi3SetTime") && sn_set_time((sn_instance *)c, time) ? fmi3OK : fmi3Error;
+}
+
+#define SN_STATELESS3(name, type)                                                                                   \
+    SN_EXPORT fmi3Status name(fmi3Instance c, type x[], size_t n)                                                   \
+    {                                                                                                               \
+        (void)x;                                                                                                    \
+        if (!sn_exchanges3(c, #name))                                                                               \
+            return fmi3Error;                                                                                       \
+        return n == 0 ? fmi3OK : sn_refused3(c, "a continuous state or event indicator");                           \
+    }
+SN_STATELESS3(fmi3SetContinuousStates, const fmi3Float64)
+SN_STATELESS3(fmi3GetContinuousStateDerivatives, fmi3Float64)
+SN_STATELESS3(fmi3GetEventIndicators, fmi3Float64)
+SN_STATELESS3(fmi3GetContinuousStates, fmi3Float64)
+SN_STATELESS3(fmi3GetNominalsOfContinuousStates, fmi3Float64)
 
 #endif

@@ -1,6 +1,9 @@
 /* One instance of a model, apart from the version of FMI that it is called by. Value references count inputs, outputs,
  * parameters. Sample n is at t_0 + n T_s; it is taken in the communication step that begins at or before it, with the
- * inputs held then. A plant's new outputs show when communication reaches sample n + 1, those of all else at once. */
+ * inputs held then. A plant's new outputs show when communication reaches sample n + 1, those of all else at once.
+ * Model Exchange: no continuous states, and a time event at each sample, where it is taken with the inputs of that
+ * event. A plant's outputs of sample n show in the event at t_0 + n T_s, as in Co-Simulation; those of all else as well,
+ * which is one sample before the end of the communication step that shows them in Co-Simulation. */
 #ifndef SN_INSTANCE_H
 #define SN_INSTANCE_H
 
@@ -25,6 +28,12 @@ typedef struct {
     sn_v1 next_state, next;
     sn_v2 state_rows, input_rows, next_rows;
     int looked;
+    /* Of Model Exchange: whether it is one and in event mode; the event at `instant` took samples from number `first` on,
+     * out of what `saved` holds (pending outputs, state), with the inputs in `seen`, `rounds` times. */
+    int exchange, event, sampled;
+    double instant;
+    int64_t first, rounds;
+    sn_v1 saved, seen;
     char *instance_name;
     /* Of the version of FMI. */
     void (*tell)(void *self, int status, const char *text);
@@ -33,8 +42,8 @@ typedef struct {
 } sn_instance;
 
 typedef struct {
-    double start, time;
-    int64_t count, running;
+    double start, time, instant;
+    int64_t count, running, event, sampled, first, rounds;
     double values[];
 } sn_snapshot;
 
@@ -112,8 +121,8 @@ static size_t sn_room_needed(const sn_node *node)
 static int sn_make_room(sn_instance *s)
 {
     const sn_model *m = &s->model;
-    size_t ports = (size_t)m->n_in + m->n_out + m->n_par, own = m->n_out - m->ahead, looks, i;
-    double *p;
+    size_t ports = (size_t)m->n_in + m->n_out + m->n_par, own = m->n_out - m->ahead, looks, kept, i;
+    double *p, *more;
     s->work.size = 262144u + sn_room_needed(&m->root) + 64u * ports;
     s->work.base = (unsigned char *)malloc(s->work.size);
     if (s->work.base == NULL)
@@ -124,7 +133,8 @@ static int sn_make_room(sn_instance *s)
         return 0;
     }
     looks = m->ahead > 0 ? 2u * ((size_t)s->states + own) + m->n_in : 0u;
-    p = (double *)calloc(ports + own + (size_t)s->states + looks + 1u, sizeof(double));
+    kept = s->exchange ? own + (size_t)s->states + m->n_in : 0u;
+    p = (double *)calloc(ports + own + (size_t)s->states + kept + looks + 1u, sizeof(double));
     s->warned = (unsigned char *)calloc(m->n_in + 1u, 1);
     if (p == NULL || s->warned == NULL) {
         free(p);
@@ -136,8 +146,11 @@ static int sn_make_room(sn_instance *s)
     s->parameters = (sn_v1){p + m->n_in + m->n_out, (int32_t)m->n_par, 1};
     s->pending = (sn_v1){p + ports, (int32_t)own, 1};
     s->state = (sn_v1){p + ports + own, (int32_t)s->states, 1};
+    more = s->state.p + s->states;
+    s->saved = (sn_v1){more, s->exchange ? (int32_t)(own + (size_t)s->states) : 0, 1};
+    s->seen = (sn_v1){more + s->saved.n, s->exchange ? (int32_t)m->n_in : 0, 1};
+    more += kept;
     if (m->ahead > 0) {
-        double *more = s->state.p + s->states;
         s->next_state = (sn_v1){more, (int32_t)s->states, 1};
         s->next = (sn_v1){more += s->states, (int32_t)own, 1};
         s->state_rows = (sn_v2){more += own, (int32_t)s->states, 1, 1, 1};
@@ -161,7 +174,7 @@ static void sn_restart(sn_instance *s)
     s->start = s->time = 0.0;
     s->stop = SN_NEVER;
     s->count = 0;
-    s->running = 0;
+    s->running = s->event = s->sampled = 0;
     s->stale = 1;
     s->looked = 0;
 }
@@ -214,6 +227,7 @@ static int sn_begin(sn_instance *s, double start, double stop)
     s->start = s->time = start;
     s->stop = stop;
     s->count = 0;
+    s->sampled = 0;
     s->looked = 0;
     return 1;
 }
@@ -224,6 +238,7 @@ static int sn_run(sn_instance *s)
     if (!sn_initialise(s))
         return 0;
     s->running = 1;
+    s->event = s->exchange; /* initialisation ends in the first event */
     return 1;
 }
 
@@ -248,8 +263,9 @@ static int sn_take_sample(sn_instance *s)
 static int sn_do_step(sn_instance *s, double time, double size)
 {
     double period = s->model.sample_time, slack = SN_SAME_TIME * period, end = time + size;
-    if (!s->running) {
-        sn_say(s, SN_FAIL, "a step before the initialisation has ended.");
+    if (s->exchange || !s->running) {
+        sn_say(s, SN_FAIL, s->exchange ? "this instance is for Model Exchange, which has no communication steps."
+                                       : "a step before the initialisation has ended.");
         return 0;
     }
     if (!sn_finite(end) || size < 0.0 || end - s->start > ((double)s->count + SN_MOST_SAMPLES) * period) {
@@ -273,20 +289,102 @@ static int sn_do_step(sn_instance *s, double time, double size)
     return 1;
 }
 
-/* Whether the next sample is still open: behind a sample that was taken between two, inputs no longer change it. */
-static int sn_awaits(const sn_instance *s)
+/* Whether the next sample is due. */
+static int sn_due(const sn_instance *s)
 {
     double period = s->model.sample_time;
     return s->start + (double)s->count * period <= s->time + SN_SAME_TIME * period;
 }
 
+/* Whether a sample was taken in the event at this time: other inputs take it anew, from what was saved. */
+static int sn_at_sample(const sn_instance *s) { return s->sampled && s->time == s->instant; }
+
+/* Whether the next sample is still open: behind a sample that was taken between two, inputs no longer change it. */
+static int sn_awaits(const sn_instance *s)
+{
+    return sn_due(s) || (s->exchange && (!s->model.plant || sn_at_sample(s)));
+}
+
+/* Model Exchange. */
+static int sn_set_time(sn_instance *s, double time)
+{
+    if (!sn_finite(time)) {
+        sn_say(s, SN_FAIL, "the time was set to %f; it must be finite.", time);
+        return 0;
+    }
+    s->time = time;
+    s->looked = 0;
+    return 1;
+}
+
+static int sn_enter_event(sn_instance *s)
+{
+    if (!s->running) {
+        sn_say(s, SN_FAIL, "an event before the initialisation has ended.");
+        return 0;
+    }
+    s->event = 1;
+    if (s->model.plant && sn_due(s)) /* outputs of this sample, which its inputs do not change */
+        memcpy(s->outputs.p, s->pending.p, (size_t)s->pending.n * sizeof(double));
+    return 1;
+}
+
+#define SN_MOST_ROUNDS 1000 /* event iterations of one sample: importers stop far before */
+
+/* Take what is due, or take it anew where the importer iterates over inputs. `again`: outputs have changed, and whoever
+ * they are connected to must see them. `next`: the time of the next sample, counted and not summed. */
+static int sn_update(sn_instance *s, int *again, double *next)
+{
+    double period = s->model.sample_time;
+    size_t held = (size_t)s->saved.n * sizeof(double), given = (size_t)s->seen.n * sizeof(double);
+    int anew = sn_at_sample(s) && memcmp(s->seen.p, s->inputs.p, given) != 0;
+    *again = 0;
+    if (!s->running || !s->event) {
+        sn_say(s, SN_FAIL, "discrete states are updated in event mode only.");
+        return 0;
+    }
+    if (s->time - s->start > ((double)s->count + SN_MOST_SAMPLES) * period) {
+        sn_say(s, SN_FAIL, "an event at %g s is too late.", s->time);
+        return 0;
+    }
+    if (anew && s->rounds >= SN_MOST_ROUNDS) {
+        sn_say(s, SN_FAIL, "its inputs do not settle in the event at %g s: delay one signal of the loop by a sample.", s->time);
+        return 0;
+    }
+    if (anew || (!sn_at_sample(s) && sn_due(s))) {
+        if (!sn_initialise(s))
+            return 0;
+        if (anew) { /* pending outputs and state stand behind each other */
+            memcpy(s->pending.p, s->saved.p, held);
+            s->count = s->first;
+        } else {
+            memcpy(s->saved.p, s->pending.p, held);
+            s->first = s->count;
+            s->rounds = 0;
+        }
+        memcpy(s->seen.p, s->inputs.p, given);
+        s->instant = s->time;
+        s->sampled = 1;
+        s->rounds++;
+        do {
+            s->looked = 0;
+            if (!sn_take_sample(s))
+                return 0;
+        } while (sn_due(s));
+        *again = !s->model.plant || s->count > s->first + 1;
+    }
+    *next = s->start + (double)s->count * period;
+    return 1;
+}
+
 /* State and outputs of the next sample, if the inputs are held; with `SN_MOVE` what moves them as well. */
 static int sn_work_out(sn_instance *s, int how)
 {
-    memcpy(s->next.p, s->pending.p, (size_t)s->next.n * sizeof(double));
+    const double *from = s->model.plant && sn_at_sample(s) ? s->saved.p : s->pending.p;
+    memcpy(s->next.p, from, (size_t)s->next.n * sizeof(double));
     if (!sn_awaits(s))
         return 1;
-    memcpy(s->next_state.p, s->state.p, (size_t)s->state.n * sizeof(double));
+    memcpy(s->next_state.p, from + s->pending.n, (size_t)s->state.n * sizeof(double));
     s->looked &= ~SN_WORKED_OUT; /* nothing of a step that fails */
     if (!sn_worked(s, how))
         return 0;
@@ -443,10 +541,11 @@ static SN_MERGED int sn_get(sn_instance *s, uint32_t i, double *value)
     return sn_get_rarely(s, i, value);
 }
 
-/* The whole state, to the bit: values, pending outputs and state vector stand behind each other. */
+/* The whole state, to the bit: values, pending outputs and state vector stand behind each other, and in Model Exchange
+ * what the sample of this event was taken from. */
 static size_t sn_snapshot_bytes(const sn_instance *s)
 {
-    return (size_t)(s->values.n + s->pending.n + s->state.n) * sizeof(double);
+    return (size_t)(s->values.n + s->pending.n + s->state.n + s->saved.n + s->seen.n) * sizeof(double);
 }
 
 static sn_snapshot *sn_take_snapshot(sn_instance *s, sn_snapshot *into)
@@ -463,6 +562,11 @@ static sn_snapshot *sn_take_snapshot(sn_instance *s, sn_snapshot *into)
     into->time = s->time;
     into->count = s->count;
     into->running = s->running;
+    into->event = s->event;
+    into->sampled = s->sampled;
+    into->instant = s->instant;
+    into->first = s->first;
+    into->rounds = s->rounds;
     memcpy(into->values, s->values.p, sn_snapshot_bytes(s));
     return into;
 }
@@ -473,6 +577,11 @@ static void sn_go_back(sn_instance *s, const sn_snapshot *from)
     s->time = from->time;
     s->count = from->count;
     s->running = (int)from->running;
+    s->event = (int)from->event;
+    s->sampled = (int)from->sampled;
+    s->instant = from->instant;
+    s->first = from->first;
+    s->rounds = from->rounds;
     memcpy(s->values.p, from->values, sn_snapshot_bytes(s));
     s->stale = 0;
     s->looked = 0;
@@ -489,7 +598,7 @@ static void sn_serialise(const sn_instance *s, const sn_snapshot *from, unsigned
     size_t named = strlen(s->model.guid);
     uint32_t crc;
     memset(to, 0, SN_SERIAL_HEAD);
-    memcpy(to, "SNSTATE1", 8);
+    memcpy(to, "SNSTATE2", 8);
     memcpy(to + 8, &size, 8);
     memcpy(to + 24, s->model.guid, named < 39 ? named : 39);
     memcpy(to + SN_SERIAL_HEAD, from, (size_t)size - SN_SERIAL_HEAD);
@@ -509,7 +618,7 @@ static sn_snapshot *sn_deserialise(sn_instance *s, const unsigned char *from, si
         memcpy(&stated, from + 8, 8);
         memcpy(&crc, from + 16, 4);
     }
-    if (stated != size || size == 0 || memcmp(from, "SNSTATE1", 8) != 0 || memcmp(from + 24, guid, 40) != 0
+    if (stated != size || size == 0 || memcmp(from, "SNSTATE2", 8) != 0 || memcmp(from + 24, guid, 40) != 0
         || crc != sn_crc32(from + 24, size - 24)) {
         sn_say(s, SN_FAIL, "the FMU state comes from another FMU or is damaged.");
         return NULL;
@@ -521,7 +630,10 @@ static sn_snapshot *sn_deserialise(sn_instance *s, const unsigned char *from, si
     }
     memcpy(made, from + SN_SERIAL_HEAD, size - SN_SERIAL_HEAD);
     made->running = made->running != 0;
-    if (!sn_finite(made->start) || !sn_finite(made->time) || made->count < 0 || made->count > INT64_MAX / 2) {
+    made->event = made->event != 0;
+    made->sampled = made->sampled != 0;
+    if (!sn_finite(made->start) || !sn_finite(made->time) || !sn_finite(made->instant) || made->count < 0 ||
+        made->count > INT64_MAX / 2 || made->first < 0 || made->first > made->count) {
         free(made);
         sn_say(s, SN_FAIL, "the FMU state is damaged.");
         return NULL;
@@ -563,7 +675,7 @@ static int sn_path_of(const char *uri, char *path, size_t room)
 }
 
 /* Make an instance from resources/model.bin; `resources` is a path. NULL where that fails; the reason was told. */
-static sn_instance *sn_instantiate(const char *resources, const char *guid, const char *name,
+static sn_instance *sn_instantiate(int exchange, const char *resources, const char *guid, const char *name,
                                    void (*tell)(void *, int, const char *), void *environment, void *logger)
 {
     char error[SN_TEXT], path[4096];
@@ -572,6 +684,7 @@ static sn_instance *sn_instantiate(const char *resources, const char *guid, cons
     int fits;
     if (s == NULL)
         return NULL;
+    s->exchange = exchange;
     s->tell = tell;
     s->environment = environment;
     s->logger = logger;
