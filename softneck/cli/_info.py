@@ -214,7 +214,7 @@ def _fmu(file: Path) -> dict[str, Any]:
             f"{file}: is not an FMU ({str(error).splitlines()[0] if str(error) else error!r})."
         ) from error
     by_causality = {
-        f"{causality}s": ", ".join(v.name for v in description.modelVariables if v.causality == causality)
+        f"{causality}s": ", ".join(cosim.shown_name(v) for v in description.modelVariables if v.causality == causality)
         for causality in ("input", "output", "parameter")
     }
     return {

@@ -43,11 +43,17 @@ _WORST_RUNS = 3
 @click.option(
     "--html", type=click.Path(path_type=Path), help="Write a page with plots, and beside it the robot in 3-D."
 )
+@click.option(
+    "--step",
+    type=click.FloatRange(min=0.0, min_open=True),
+    metavar="S",
+    help="Step [s] of an SSP archive; needed if neither it nor its FMUs state one.",
+)
 @trust_option
 @common_options("robot", "force")
 def command(
-    loop_file: Path, output: Path | None, certificate: Path | None, html: Path | None, robot: str | None, trust: bool,
-    force: bool, as_json: bool,
+    loop_file: Path, output: Path | None, certificate: Path | None, html: Path | None, step: float | None,
+    robot: str | None, trust: bool, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Close the loop that LOOP.toml describes; exit code 1 if one of its limits does not hold.
 
@@ -64,6 +70,8 @@ def command(
         return
     from softneck.loop import System
 
+    if step is not None and (loop_file.suffix.lower() != ".ssp" or robot is not None):
+        raise SettingsError(f"{loop_file}: `--step` is for SSP archives; a loop file has `sample_time_s` in each part.")
     path, replace = target(output, f"results/{loop_file.stem}.csv", force=force)
     signals.recording_suffix(path)
     refuse_existing(path, force=replace)
@@ -71,7 +79,7 @@ def command(
         if extra is not None:
             refuse_existing(extra, force=force)
     if loop_file.suffix == ".ssp" and robot is None:
-        setup = cosim.load_ssp(loop_file)
+        setup = cosim.load_ssp(loop_file, step=step)
         if isinstance(setup, System):
             _simulate_system(setup, loop_file, path, certificate, html, force=replace, as_json=as_json)
             return
@@ -111,6 +119,8 @@ def command(
     failed = [row["metric"] for row in result.limits if not row["holds"]]
     if failed:
         raise CheckFailedError(f"{loop_file}: {len(failed)} limit(s) do not hold: {', '.join(failed)}.")
+    if result.limits and not result.holds:
+        raise CheckFailedError(f"{loop_file}: its limits are not shown to hold: the run ended early.")
 
 
 def _simulate_system(
@@ -123,6 +133,8 @@ def _simulate_system(
         raise SettingsError(f"{path}: the outputs of a system that is no closed loop go to a .csv file.")
     with progress("simulate", quiet=as_json) as report:
         result = cosim.run_setup(system, report=lambda done: report(done, source.name))
+    for remark in result.remarks:
+        click.echo(f"warning: {remark}", err=True)
     with atomic_write(path, force=force) as temporary:
         result.frame.to_csv(temporary, index=False)
     if as_json:

@@ -29,6 +29,7 @@ from .loops._loop_parts import read_toml as read_toml
 from .loops._simulate import describe_excess_range as describe_excess_range
 from .loops._simulate import run_setup as run_setup
 from .parts._variables import interfaces_of as interfaces_of
+from .parts._variables import shown_name as shown_name
 from .studies._run_study import WorkerPool as WorkerPool
 from .studies._run_study import open_workers as open_workers
 from .studies._run_study import run_study as run_study

@@ -26,6 +26,7 @@ from ._faults import make_fault as make_fault
 from ._loop import ORDERS as ORDERS
 from ._loop import PART_NAMES as PART_NAMES
 from ._loop import USE_MOTOR_POSITIONS as USE_MOTOR_POSITIONS
+from ._loop import EndedError as EndedError
 from ._loop import Link as Link
 from ._loop import System as System
 from ._references import AheadReference as AheadReference

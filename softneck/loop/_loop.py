@@ -8,12 +8,16 @@ from typing import Protocol
 
 import numpy as np
 
-from softneck.core import ReprMixin, SettingsError, Vector, require_one_of, require_positive
+from softneck.core import ReprMixin, SettingsError, SoftneckError, Vector, require_one_of, require_positive
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, load_runtime
 
 from ._faults import Fault
 from ._references import Reference
+
+
+class EndedError(SoftneckError):
+    """A part ended the simulation itself; a loop keeps its rows up to there."""
 
 
 class Part(Protocol):

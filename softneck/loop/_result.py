@@ -25,6 +25,7 @@ class LoopResult(ReprMixin):
         units: name -> unit.
         sample_time: [s].
         robot: that was controlled.
+        ended: why the run is shorter than it was meant, if a part ended it.
     """
 
     time: Vector
@@ -32,6 +33,7 @@ class LoopResult(ReprMixin):
     units: Mapping[str, str]
     sample_time: float
     robot: Robot = field(default_factory=Robot.preset)
+    ended: str = ""
 
     def summary(self) -> str:
         """Return one line on duration, step and signals."""

@@ -17,7 +17,7 @@ from softneck.robot import is_set_point
 from softneck.runtime import Port, load_linked, load_runtime
 
 from ._disturbed_bus import FaultStages, place_faults
-from ._loop import BlockPart, Loop, Part, System
+from ._loop import BlockPart, EndedError, Loop, Part, System
 from ._references import reference_ports
 from ._result import LoopResult
 from ._rows_runtime import ROWS_DISTURB, ROWS_RECORD, ROWS_REFER, ROWS_SHOW, ROWS_STEP, run_rows
@@ -287,6 +287,7 @@ class LoopRun:
             _is_its_block(part) and load_runtime(part.block.runtime).compiled for part in self._parts.values()
         )
         self._running: LoopRows | None = None
+        self._ended = ""
 
     def __enter__(self) -> LoopRun:
         return self
@@ -326,6 +327,12 @@ class LoopRun:
                 problem, part = running.run(
                     self.row, min(stop, end), self._table, compiled=self._compile and not watched
                 )
+            except EndedError as error:
+                if running.row == 0:
+                    raise
+                self.row = running.row
+                self._cut(str(error))
+                break
             finally:
                 self.row = running.row
             if problem:  # raises the DataError of the part's inputs or outputs
@@ -340,10 +347,13 @@ class LoopRun:
                     clock.sleep(rest)
             k = self.row - 1
             if on_step is not None and on_step(LoopStep(k, k * self.step, self._table[k], self._columns)):
-                self._table = self._table[: self.row]
-                self.rows = self.row
+                self._cut("")
                 break
         return self.row == self.rows
+
+    def _cut(self, reason: str) -> None:
+        """End the run with the rows so far."""
+        self._table, self.rows, self._ended = self._table[: self.row], self.row, reason
 
     def result(self) -> LoopResult:
         """Return the signals of all rows so far."""
@@ -351,7 +361,8 @@ class LoopRun:
         by_slot = {item.slot: item for item in self._wiring.named}
         for name, slot in self._columns.items():
             signals[name], units[name] = _in_si(self._table[: self.row, slot], by_slot[slot].port)
-        return LoopResult(np.arange(self.row) * self.step, signals, units, self.step, self.loop.robot)
+        time = np.arange(self.row) * self.step
+        return LoopResult(time, signals, units, self.step, self.loop.robot, self._ended)
 
     def _start(self) -> LoopRows:
         if self._running is None:

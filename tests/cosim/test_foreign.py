@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 import tempfile
+import zipfile
 from pathlib import Path
 from typing import Any
 
+import fmpy
 import numpy as np
 import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError
-from softneck.cosim import FmuError, FmuPart, IsolatedPart, load_loop, simulate
+from softneck.cosim import FmuError, FmuPart, IsolatedPart, load_loop, shown_name, simulate
+from softneck.cosim.loops._loop_file import LoopSetup
 from softneck.loop import BlockPart, Loop, SensorFault, StepReference
 
 from ._foreign import NAMES, build_foreign
@@ -127,6 +130,24 @@ def test_a_bad_fmu_costs_one_run_only(
     assert not list(Path(tempfile.gettempdir()).glob("softneck-child-*"))
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_fmu_that_ends_itself_leaves_its_rows(version: int, foreign: dict[int, Path], toys: Any) -> None:
+    def loop(mode: float, part: Any) -> LoopSetup:
+        parts = {"plant": part, "controller": BlockPart(toys.pi()), "reference": StepReference(pitch=0.1)}
+        plain = Loop(**parts, duration=0.4, plant_parameters={"mode": mode})
+        return LoopSetup(loop=plain, limits={"pitch.overshoot_pct": 1e6})
+
+    whole = simulate(loop(0.0, plant(foreign[version])))
+    assert (len(whole.signals.time), whole.holds, whole.signals.ended) == (20, True, "")
+    for kind in (FmuPart, *([IsolatedPart] if version == 2 else [])):
+        result = simulate(loop(5.0, plant(foreign[version], kind)))
+        assert len(result.signals.time) == 10  # whole rows before the step from 0.2 s
+        for name, values in result.signals.signals.items():
+            np.testing.assert_array_equal(values, whole[name][:10], err_msg=name)
+        assert not result.holds  # of a run that was not finished nothing is known
+        assert "in the step from t = 0.2 s it asked to end the simulation" in result.remarks[0]
+
+
 def test_nan_and_errors_of_an_fmu_name_it(foreign: dict[int, Path], toys: Any) -> None:
     part = plant(foreign[2])
     for mode, error, message in ((3, DataError, "output `pitch` of the plant became nan"), (4, FmuError, "DoStep")):
@@ -150,6 +171,23 @@ def test_an_instance_that_is_kept_is_reset_not_loaded_again(foreign: dict[int, P
     for other in (second, third):
         np.testing.assert_array_equal(other["pitch"], first["pitch"])
     assert part._native is None
+
+
+def test_arrays_of_fmi3_are_named_as_arrays(foreign: dict[int, Path], tmp_path: Path) -> None:
+    sizes = b'<Dimension start="3"/><Dimension valueReference="7"/>'
+    array = b'<Float64 name="w" valueReference="90" causality="input" start="0">' + sizes + b"</Float64>"
+    path = tmp_path / foreign[3].name
+    with zipfile.ZipFile(foreign[3]) as old, zipfile.ZipFile(path, "w") as new:
+        for name in old.namelist():
+            data = old.read(name)
+            if name == "modelDescription.xml":
+                data = data.replace(b"</ModelVariables>", array + b"</ModelVariables>")
+            new.writestr(name, data)
+    shown = [shown_name(v) for v in fmpy.read_model_description(str(path), validate=False).modelVariables]
+    assert [name for name in shown if "[" in name] == ["w[3][mode]"]
+    assert "w" not in [port.name for port in plant(path).inputs]
+    with pytest.raises(FileFormatError, match="`w` is an array; the variables of a part are single numbers"):
+        FmuPart(path, role="plant", sample_time=TS, names={"w": "motor_setpoint_1"})
 
 
 def test_units_may_be_given_and_wrong_mappings_are_refused(foreign: dict[int, Path]) -> None:

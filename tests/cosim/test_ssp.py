@@ -12,6 +12,7 @@ from typing import Any
 import fmpy
 import numpy as np
 import pytest
+from fmpy.ssp.simulation import simulate_ssp
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it has no stubs
 
 from softneck.core import OutputFileError, SettingsError
@@ -88,6 +89,27 @@ def test_other_masters_compute_our_jacobi_loop(master: str, setup: LoopSetup, ar
         # Same FMUs, same order of calls; 1e-12 is the issue's limit and leaves room for compiled against plain Python.
         np.testing.assert_allclose(column[1:], expected[1:], rtol=0, atol=1e-12, err_msg=f"{part}.{name}")
     assert np.abs(ours["pitch"]).max() > 0.02  # the loop does move
+
+
+def test_fmpys_own_master_follows_the_loop(setup: LoopSetup, archive: Path) -> None:
+    """It gives what nothing feeds the value of the last connection: no such input is in the structure."""
+    fed = {
+        (link.get("endElement"), link.get("endConnector")) for link in structure(archive).iter(f"{_SPACE}Connection")
+    }
+    inputs = {
+        (item.get("name"), connector.get("name"))
+        for item in structure(archive).iter(f"{_SPACE}Component")
+        for connector in item.iter(f"{_SPACE}Connector")
+        if connector.get("kind") == "input"
+    }
+    assert inputs == fed
+    assert "payload" not in {name for _, name in inputs}
+    theirs = simulate_ssp(str(archive), stop_time=2.0, step_size=0.02)
+    ours = simulate(setup)
+    for axis, expected in (("pitch", 6.0), ("roll", -4.0)):
+        # It ignores parameters (a payload of 0.2 kg) and starts all at 0: the controller's integrator removes both.
+        assert np.degrees(ours[axis][-1]) == pytest.approx(expected, abs=0.3)
+        assert np.degrees(theirs[f"plant.{axis}"][-1]) == pytest.approx(expected, abs=0.3)
 
 
 def test_units_that_differ_are_converted_on_the_way(fmus: Path, toys: Any, tmp_path: Path) -> None:

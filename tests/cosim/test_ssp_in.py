@@ -134,6 +134,20 @@ def test_nested_systems_lines_units_and_values(foreign: Path, version: str, tmp_
     assert np.abs(shown[-1, :3]).min() > 1e-3, "nothing moves: the test shows nothing"
 
 
+def test_a_step_is_given_where_nothing_states_one(foreign: Path, tmp_path: Path) -> None:
+    stated, silent = ssd(), ssd().replace(f' stepSize="{STEP}"', "")
+    with pytest.raises(SettingsError, match="has a step size; give one in s, for instance `--step"):
+        load_ssp(archive(tmp_path, foreign, silent))
+    expected = simulate(load_ssp(archive(tmp_path, foreign, stated)))
+    given = simulate(load_ssp(archive(tmp_path, foreign, silent), step=STEP))
+    finer = simulate(load_ssp(archive(tmp_path, foreign, stated), step=STEP / 2))
+    for name, values in expected.signals.signals.items():
+        np.testing.assert_array_equal(given[name], values)
+    assert len(finer.signals.time) == 2 * len(expected.signals.time)
+    with pytest.raises(SettingsError, match="`step` must be positive"):
+        load_ssp(archive(tmp_path, foreign, stated), step=float("nan"))
+
+
 def test_what_was_read_is_written_again(foreign: Path, tmp_path: Path) -> None:
     first = load_ssp(archive(tmp_path, foreign, ssd()))
     again = load_ssp(write_ssp(first, tmp_path / "again.ssp"))

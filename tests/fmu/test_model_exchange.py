@@ -207,7 +207,7 @@ def test_sensitivities_are_those_of_co_simulation(kind: str, tmp_path: Path) -> 
     reals = [i for i, port in enumerate(block.inputs) if not port.boolean]
     model = fmpy.read_model_description(str(tmp_path / "M.fmu"))
     ahead = [v.valueReference for v in model.modelVariables if v.name.endswith("_next")]
-    u = inputs_of(block, 12, missing=False)[:, reals]
+    u, expected = inputs_of(block, 12, missing=False)[:, reals], []
 
     def look(fmu: Any, row: np.ndarray) -> list[float]:
         fmu.setReal(reals, row)
@@ -263,7 +263,7 @@ def test_a_part_steps_a_model_exchange_fmu_as_its_co_simulation(kind: str, fmi: 
     u = inputs_of(block, ROWS)
     with FmuPart(tmp_path / "M.fmu") as stepped, FmuPart(other) as events:
         np.testing.assert_array_equal(events.start(0.1, {}), stepped.start(0.1, {}))
-        saved = b""
+        saved, expected, last = b"", np.zeros(0), np.ones(0)
         for k, row in enumerate(u):
             if k == 10:
                 saved = events.get_state()

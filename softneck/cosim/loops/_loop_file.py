@@ -78,11 +78,12 @@ def load_loop(path: str | Path, *, robot: str | None = None) -> LoopSetup:
         raise type(error)(f"{source}: {error}") from error
 
 
-def load_ssp(path: str | Path) -> LoopSetup | System:
+def load_ssp(path: str | Path, *, step: float | None = None) -> LoopSetup | System:
     """Read an SSP 1.0 or 2.0 archive of FMUs for co-simulation, of any tool.
 
     Args:
         path: of the archive; its FMUs are unpacked until this process ends.
+        step: [s], instead of the archive's own.
 
     Returns:
         A loop if the FMUs are one plant, one controller and one reference (of softneck, or with these names), and
@@ -92,7 +93,7 @@ def load_ssp(path: str | Path) -> LoopSetup | System:
         FileFormatError: no archive, a damaged one, or one that names files that are missing or outside of it.
         SettingsError: features that a loop does not have, such as signal dictionaries; the message names them.
     """
-    read = read_ssp(path)
+    read = read_ssp(path, step=step)
     if read.closed:
         return _load_ssp_loop(Path(path), None, read)
     opener = PartOpener(Path())

@@ -66,7 +66,8 @@ class Result(ReprMixin):
     def summary(self) -> str:
         """Return a line on the run, one on its limits, and the remarks."""
         rows, failed = self.limits, [row["metric"] for row in self.limits if not row["holds"]]
-        text = f"fails {', '.join(failed)}" if failed else f"keeps {len(rows)} limits" if rows else "no limits stated"
+        kept = f"keeps {len(rows)} limits" if rows else "no limits stated"
+        text = f"fails {', '.join(failed)}" if failed else kept
         return f"{self.signals.summary()}\n{text}" + "".join(f"\n{remark}" for remark in self.remarks)
 
     def __getitem__(self, name: str) -> Vector:
@@ -90,8 +91,8 @@ class Result(ReprMixin):
 
     @property
     def holds(self) -> bool:
-        """Whether there are limits, and all of them hold."""
-        return bool(self.bounds) and all(row["holds"] for row in self.limits)
+        """Whether there are limits, and all of them hold in a run that no part ended early."""
+        return bool(self.bounds) and not self.signals.ended and all(row["holds"] for row in self.limits)
 
     @property
     def real_time_factor(self) -> float:
@@ -246,8 +247,9 @@ def run_setup(
     begin = time.perf_counter()
     signals = run_loop(plain, report, on_step=on_step, pace=pace, keep=keep, compiled=compiled)
     wall = time.perf_counter() - begin
+    ended = (f"the run ended early: {signals.ended}",) if signals.ended else ()
     if isinstance(setup, System):
-        return Result(signals=signals, wall_time=wall, order=plain.order, closed=False)
+        return Result(signals=signals, wall_time=wall, order=plain.order, closed=False, remarks=ended)
     loop = setup.loop
     beyond = describe_excess_range(loop.controller, loop.controller_parameters, loop.robot)
     return Result(
@@ -257,7 +259,7 @@ def run_setup(
         files=setup.files,
         order=plain.order,
         angle=setup.angle,
-        remarks=(*([f"{beyond}."] if beyond else []), *validity_remarks(signals, loop.plant)),
+        remarks=(*ended, *([f"{beyond}."] if beyond else []), *validity_remarks(signals, loop.plant)),
     )
 
 

@@ -272,6 +272,7 @@ def _component(name: str, part: Part, source: Path, loop: Loop | System, wiring:
         return replace(port, name=_fmu_name(part, port.name))
 
     tap = wiring.taps[name]
+    fed = {port.name for port, owner in zip(tap.ports, tap.owners, strict=True) if owner}
     constants = {
         port.name: wiring.start[slot]
         for port, owner, slot in zip(tap.ports, tap.owners, tap.slots.tolist(), strict=True)
@@ -288,7 +289,8 @@ def _component(name: str, part: Part, source: Path, loop: Loop | System, wiring:
     return Component(
         name=name,
         source=f"resources/{source.name}",
-        inputs=tuple(map(with_fmu_name, part.inputs)),
+        # Only those that something feeds: a master may give the others the value of any connection (fmpy does).
+        inputs=tuple(with_fmu_name(port) for port in part.inputs if port.name in fed),
         outputs=tuple(map(with_fmu_name, part.outputs)),
         values=tuple((with_fmu_name(known[key]), float(value)) for key, value in values.items()),
     )

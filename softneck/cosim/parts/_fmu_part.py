@@ -21,7 +21,7 @@ from softneck.core import (
     require_positive,
 )
 from softneck.fmu import unpack, unpacked
-from softneck.loop import PART_NAMES
+from softneck.loop import PART_NAMES, EndedError
 from softneck.signals import Recording
 
 from ._native import ERROR, FATAL, Bank, CallError, Native
@@ -142,6 +142,8 @@ class FmuPart:
             return self._outputs.read()
         except CallError as error:
             raise self._call_error(f"in the step from t = {time:g} s", error) from error
+        except EndedError as error:
+            raise EndedError(f"{self.path}: in the step from t = {time:g} s {error}.") from error
 
     def _reach(self, native: Native, time: float) -> Vector:
         """Enter the event at `time` [s]; return a plant's outputs there, and those before it of any other part."""
@@ -257,7 +259,9 @@ def _sample_time(description: Description, given: float | None) -> float:
     experiment = description.model.defaultExperiment
     step = given if given is not None else number_of(getattr(experiment, "stepSize", None), None)
     if step is None:
-        raise SettingsError(f"{description.path}: states no step size; give its sample time in s.")
+        raise SettingsError(
+            f"{description.path}: states no step size; give its sample time in s (`sample_time_s` in a loop file)."
+        )
     require_positive("sample_time", step, "s")
     return float(step)
 

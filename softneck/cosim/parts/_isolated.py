@@ -29,11 +29,12 @@ from softneck.core import (
     Vector,
     require_positive,
 )
+from softneck.loop import EndedError
 
 from ._fmu_part import FmuError, FmuPart, naming_arguments
 
 _ERRORS: dict[str, type[SoftneckError]] = {
-    kind.__name__: kind for kind in (FmuError, DataError, FileFormatError, OutputFileError, SettingsError)
+    kind.__name__: kind for kind in (FmuError, EndedError, DataError, FileFormatError, OutputFileError, SettingsError)
 }
 # The import of softneck in the child and the FMU's loading take a second or two on a busy machine.
 _START_TIMEOUT_S = 60.0

@@ -13,13 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import Vector
+from softneck.loop import EndedError
 
 from ._variables import FMI_TYPES, Description
 
 if TYPE_CHECKING:
     from fmpy.model_description import ScalarVariable
 
-OK_OR_WARNING, ERROR, FATAL = 1, 3, 4
+OK_OR_WARNING, DISCARD, ERROR, FATAL = 1, 2, 3, 4
+_TERMINATED = 3  # fmi2StatusKind
 _STATUS_TEXTS = ("OK", "a warning", "discard", "an error", "a fatal error", "pending")
 Log = Callable[[int, str], None]
 _MOST_ITERATIONS = 100  # of one event
@@ -61,6 +63,7 @@ class Native:
         self._log = log
         self._step: Callable[..., int] | None = None
         self._step_rest: tuple[Any, ...] = ()
+        self._ends: ctypes.c_bool | None = None
 
     def instantiate(self) -> None:
         """Create the instance and prepare the call of a step."""
@@ -94,6 +97,7 @@ class Native:
             return self.function("fmi2DoStep", types), (1,)
         flags = [ctypes.c_bool() for _ in range(3)]
         self._step_outputs = (*flags, ctypes.c_double())
+        self._ends = flags[1]  # terminateSimulation
         types = [ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_bool] + [ctypes.c_void_p] * 4
         return self.function("fmi3DoStep", types), (True, *(ctypes.addressof(item) for item in self._step_outputs))
 
@@ -120,7 +124,17 @@ class Native:
         """Step from `time` by `size` [s]; raise CallError on a bad status."""
         status = self._step(self.fmu.component, time, size, *self._step_rest)  # pyright: ignore[reportOptionalCall]
         if status > OK_OR_WARNING:
+            if status == DISCARD and self.version == 2 and self._has_terminated():
+                raise EndedError("it asked to end the simulation")
             raise CallError(f"fmi{self.version}DoStep", status)
+        if self._ends is not None and self._ends.value:
+            raise EndedError("it asked to end the simulation")
+
+    def _has_terminated(self) -> bool:
+        """Return whether an FMU of FMI 2.0 discarded a step because it ends the simulation."""
+        ended = ctypes.c_int()
+        ask = self.function("fmi2GetBooleanStatus", [ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p])
+        return ask(self.fmu.component, _TERMINATED, ctypes.byref(ended)) <= OK_OR_WARNING and ended.value != 0
 
     def _step_over_events(self, _component: Any, time: float, size: float) -> int:
         """Finish the event at `time` and handle those before its end; Model Exchange without continuous states."""
@@ -144,7 +158,7 @@ class Native:
         for _ in range(_MOST_ITERATIONS):
             again, ended, _, _, defined, time = self._ask(update)
             if ended:
-                raise CallError("its event asked to end the simulation; it", ERROR)
+                raise EndedError("it asked to end the simulation")
             if not again:
                 self._next_event = time if defined else math.inf
                 self._ask(self.fmu.enterContinuousTimeMode)

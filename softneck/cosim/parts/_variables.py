@@ -129,6 +129,9 @@ def read_description(
     absent = sorted(set(names) - known)
     if absent:
         raise FileFormatError(f"{path}: has no variable {', '.join(absent)}; it has {', '.join(sorted(known))}.")
+    arrays = {v.name: v.dimensions for v in model.modelVariables if v.dimensions}
+    if wanted := sorted(arrays.keys() & set(names)):
+        raise FileFormatError(f"{path}: `{wanted[0]}` is an array; the variables of a part are single numbers.")
     numbers = [v for v in model.modelVariables if v.type in FMI_TYPES[version] and not v.dimensions]
     variables: dict[str, ScalarVariable] = {}
     for variable in numbers:
@@ -144,6 +147,12 @@ def read_description(
     except ET.ParseError as error:  # fmpy's parser accepts more than Python's
         raise FileFormatError(f"{path}: its modelDescription.xml cannot be read ({error}).") from error
     return Description(path, model, annotation, variables, version, units or {})
+
+
+def shown_name(variable: ScalarVariable) -> str:
+    """Return the name of a variable; that of an array of FMI 3.0 with its size, such as `u[3]` or `u[n][2]`."""
+    sizes = (item.start or (item.variable.name if item.variable is not None else "?") for item in variable.dimensions)
+    return f"{variable.name}{''.join(f'[{size}]' for size in sizes)}"
 
 
 def interfaces_of(model: ModelDescription) -> list[str]:

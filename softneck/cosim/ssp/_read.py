@@ -6,11 +6,11 @@ import atexit
 import re
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from softneck.core import SI_BASES, DataError, FileFormatError, SettingsError, to_si
+from softneck.core import SI_BASES, DataError, FileFormatError, SettingsError, require_positive, to_si
 from softneck.fmu import unpack, unpacked
 from softneck.loop import PART_NAMES, USE_MOTOR_POSITIONS
 from softneck.robot import is_set_point
@@ -291,7 +291,7 @@ class StructureTable:
     closed: bool
 
 
-def read_ssp(path: str | Path) -> StructureTable:
+def read_ssp(path: str | Path, *, step: float | None = None) -> StructureTable:
     """Read an SSP 1.0 or 2.0 archive of FMUs for co-simulation (FMI 2.0 or 3.0), of any tool.
 
     Nested systems become flat; transformations and units of connections become factors and offsets; parameter sets and
@@ -305,6 +305,9 @@ def read_ssp(path: str | Path) -> StructureTable:
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     reader = StructureReader(source, folder)
     structure = reader.structure()
+    if step is not None:
+        require_positive("step", step, "s")
+        structure = replace(structure, step=step)
     files = {component.source: reader.file(component.source) for component in _components(structure.root)}
     if not files:
         raise SettingsError(f"{source}: its structure has no components; there is nothing to run.")
@@ -417,9 +420,8 @@ class _TableBuilder:
             return self.structure.step
         if not (steps := self._experiment_values("stepSize")):
             raise SettingsError(
-                f"{self.source}: neither the structure nor an FMU has a step size; put `<ssd:Annotations>"
-                '<ssc:Annotation type="softneck"><Master order="jacobi" stepSize="0.01"/></ssc:Annotation>'
-                "</ssd:Annotations>` at the end of its system."
+                f"{self.source}: neither the structure nor an FMU has a step size; give one in s, for instance "
+                "`--step 0.01`."
             )
         return min(steps)
 

@@ -35,8 +35,9 @@ _KNOWN_ROLES = ("plant", "observer", "controller", "reference")
 
 
 def build_fmu(
-    thing: Buildable | Block | str | Path, path: str | Path, *, info: FmuInfo | None = None, force: bool = False
-) -> Path:
+    thing: Buildable | Block | str | Path, path: str | Path, *, info: FmuInfo | None = None, force: bool = False,
+    name: str | None = None,
+) -> Path:  # fmt: skip
     """Write a model, observer, controller or neck as an FMI 2.0 Co-Simulation FMU and return its path.
 
     The FMU contains the runtime of the block's kind, its arrays and pythonfmu's binaries; it needs Python
@@ -47,6 +48,7 @@ def build_fmu(
         path: `NAME.fmu`; NAME becomes the model name.
         info: texts of the FMU; those of `fmu_info` if not given.
         force: replace an existing file.
+        name: the model name, if the file shall have another.
 
     Raises:
         SettingsError: NAME is not an FMI identifier, or the block cannot be packaged.
@@ -63,7 +65,7 @@ def build_fmu(
         'Neck.fmu'
     """
     target = as_path(path)
-    name = model_name(target)
+    name = model_name(target, name)
     refuse_existing(target, force=force)
     block, said = block_and_info(thing, info)
     check_block(block)
@@ -73,17 +75,17 @@ def build_fmu(
     return target
 
 
-def model_name(path: Path) -> str:
-    """Return the model name from the name of an FMU file."""
-    name = path.stem
+def model_name(path: Path, name: str | None = None) -> str:
+    """Return the model name of an FMU file: `name`, or the stem of its file name."""
     if path.suffix != ".fmu":
         raise SettingsError(f"{path}: an FMU's file name must end in `.fmu`.")
-    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) or keyword.iskeyword(name):
+    chosen = path.stem if name is None else name
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", chosen) or keyword.iskeyword(chosen):
         raise SettingsError(
-            f"`{name}` cannot be the model name of an FMU; use letters, digits and _ only, "
-            "no digit in front and no Python keyword, and rename the file."
+            f"`{chosen}` cannot be the model name of an FMU; use letters, digits and _ only, "
+            f"no digit in front and no Python keyword{', or give a name (--name)' if name is None else ''}."
         )
-    return name
+    return chosen
 
 
 def check_block(block: Block) -> None:

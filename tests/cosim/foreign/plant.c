@@ -1,7 +1,8 @@
 /* A linear plant that knows nothing of softneck: dx/dt = (k u - x) / T by forward Euler, three drives, two angles.
 
    Compiled by the tests as FMI 2.0 (-DFMI=2) and FMI 3.0 (-DFMI=3) from fmpy's own headers.
-   It misbehaves on demand: mode 1 crashes, 2 hangs, 3 returns NaN, 4 returns an error, all from t = 0.2 s on. */
+   It misbehaves on demand: mode 1 crashes, 2 hangs, 3 returns NaN, 4 returns an error,
+   5 ends the simulation, all from t = 0.2 s on. */
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
@@ -14,6 +15,7 @@
 #define INTEGER fmi2Integer
 #define OK fmi2OK
 #define ERR fmi2Error
+#define ENDS fmi2Discard
 #else
 #include "fmi3Functions.h"
 #define INSTANCE fmi3Instance
@@ -22,6 +24,7 @@
 #define INTEGER fmi3Int32
 #define OK fmi3OK
 #define ERR fmi3Error
+#define ENDS fmi3OK
 #endif
 
 /* 0..2 drives u, 3..4 angles in deg, 5 time constant, 6 gain in deg/rad; integer 7 mode */
@@ -34,6 +37,7 @@ static STATUS go(Plant *p, REAL t, REAL h) {
         if (p->mode == 1) abort();
         if (p->mode == 2) for (;;) usleep(10000);
         if (p->mode == 4) return ERR;
+        if (p->mode == 5) return ENDS;
         p->v[3] = NAN;
         return OK;
     }
@@ -76,6 +80,10 @@ API STATUS fmi2GetInteger(INSTANCE c, const fmi2ValueReference r[], size_t n, IN
     return OK;
 }
 API STATUS fmi2DoStep(INSTANCE c, REAL t, REAL h, fmi2Boolean no) { return go(c, t, h); }
+API STATUS fmi2GetBooleanStatus(INSTANCE c, const fmi2StatusKind kind, fmi2Boolean *ended) {
+    *ended = kind == fmi2Terminated && ((Plant *)c)->mode == 5;
+    return OK;
+}
 API STATUS fmi2GetFMUstate(INSTANCE c, fmi2FMUstate *s) {
     *s = malloc(sizeof(Plant));
     memcpy(*s, c, sizeof(Plant));
@@ -131,6 +139,7 @@ API STATUS fmi3DoStep(INSTANCE c, REAL t, REAL h, fmi3Boolean no, fmi3Boolean *e
                       fmi3Boolean *early, REAL *last) {
     *event = *stop = *early = fmi3False;
     *last = t + h;
+    *stop = ((Plant *)c)->mode == 5 && t > 0.2 - 1e-9;
     return go(c, t, h);
 }
 API STATUS fmi3GetFMUState(INSTANCE c, fmi3FMUState *s) {
