@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+import softneck
 from softneck.core import SettingsError
 from softneck.fmu import FmuInfo, build_fmu, fmu_info
 from softneck.fmu.python import _build
@@ -50,9 +51,26 @@ def test_scores_of_a_validation_are_shown(tmp_path: Path) -> None:
         assert text in page
 
 
+def test_a_plant_says_what_it_is_with_its_held_out_fit() -> None:
+    model = softneck.identify("rls", recording())
+    found = model.findings["hold_out"]["fit"]
+    info = fmu_info(model)
+    fits = "/".join(f"{found[axis]:.1f}" for axis in ("pitch", "roll"))
+    dead = "/".join(f"{d * 0.02:.3g}" for d in sorted(set(model.arrays["delay"].tolist())))
+    assert info.description == (
+        "plant: 3 motor set-points [rad] -> pitch, roll [deg]; recursive least squares over the redefined inputs, with "
+        f"dead time; 20 ms; dead time {dead} s; simulation fit {fits} % on rows held out"
+    )
+    assert "None were given" not in info.documentation
+    assert f"simulation  {fits}" in info.documentation
+    assert info.stop_time == 10.0
+
+
 def test_a_model_without_scores_says_so() -> None:
-    text = fmu_info(Rls().fit(recording())).documentation
-    assert "None were given when this FMU was built" in text
+    info = fmu_info(Rls().fit(recording()))
+    assert "None were given when this FMU was built" in info.documentation
+    assert "fit" not in info.description
+    assert "Eq." not in info.description
 
 
 @pytest.mark.parametrize("lacking", ["linux64", "win64"])

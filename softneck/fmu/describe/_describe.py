@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -10,9 +11,9 @@ from html import escape
 from pathlib import Path
 from typing import Any, Protocol
 
-from softneck.core import FileFormatError, SettingsError, settings_text
+from softneck.core import KINDS, FileFormatError, SettingsError, percent, settings_text
 from softneck.design import own_controller
-from softneck.identification import Validation
+from softneck.identification import Model, Validation
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import ROBOT_PRESETS, Robot, load_for_robot
 from softneck.runtime import Block, Port
@@ -139,6 +140,12 @@ _KIND_LIMITS = {
 }
 
 
+# Of the default experiment: 10 s of the neck.
+_SHOWN_SAMPLES = 500
+# Kinds whose array `delay` is the dead time of each output [samples].
+_DELAYED_KINDS = ("rls", "oe")
+
+
 class Buildable(Protocol):
     """An object that can be exported as an FMU."""
 
@@ -201,15 +208,15 @@ def block_and_info(thing: Buildable | Block | str | Path, info: FmuInfo | None) 
 
 
 def fmu_info(
-    thing: Buildable, *, scores: str = "", validation: Validation | None = None, stop_time: float = 10.0
+    thing: Buildable, *, scores: str = "", validation: Validation | None = None, stop_time: float | None = None
 ) -> FmuInfo:
-    """Return the texts of an FMU of `thing`: its origin, scores and limits.
+    """Return the texts of an FMU of `thing`: its origin, scores and limits; of a model also its fit on rows held out.
 
     Args:
         thing: model, observer, controller or neck.
         scores: as plain text.
         validation: of a model on data that it was not trained on; its fits are included.
-        stop_time: of the default experiment [s].
+        stop_time: of the default experiment [s]; 500 samples if not given.
     """
     block = thing.block()
     summary = thing.summary()
@@ -223,20 +230,44 @@ def fmu_info(
         parts.append(f"<h2>Scores</h2><pre>{escape(scores)}</pre>")
     if validation is not None:
         parts += ["<h2>Scores</h2>", _fits(validation)]
-    elif hasattr(thing, "training_rows") and not scores:
+    # The summary has the fit on the rows held out.
+    elif isinstance(thing, Model) and not scores and not thing.findings.get("hold_out"):
         parts.append("<h2>Scores</h2><p>None were given when this FMU was built (softneck fmu --data).</p>")
     robot: Any = getattr(thing, "robot", None)
     limits = _KIND_LIMITS.get(block.kind, _LIMITS.get(block.role, ""))
     if limits:
         parts.append(f"<h2>Limits of use</h2><p>{limits}</p>")
     return FmuInfo(
-        description=summary.splitlines()[0] if summary else block.kind,
+        description=_model_line(thing, block) if isinstance(thing, Model) else _without_sources(summary, block),
         author="softneck",
         license="BSD-3-Clause (runtime); the model is its author's",
         documentation="\n".join(parts),
-        stop_time=stop_time,
+        stop_time=_SHOWN_SAMPLES * block.sample_time if stop_time is None else stop_time,
         robot=(robot.name, robot.hash) if robot is not None and robot.in_header() else None,
     )
+
+
+def _model_line(model: Model, block: Block) -> str:
+    """Return what a model is, in one line: signals with units, method, sample time, dead time, fit."""
+    robot = model.robot
+    delays = model.arrays.get("delay") if block.kind in _DELAYED_KINDS else None
+    dead = "" if delays is None else "/".join(f"{d * model.sample_time:.3g}" for d in sorted(set(delays.ravel())))
+    fits = model.findings.get("hold_out", {}).get("fit", {})
+    said = [
+        f"plant: {len(robot.set_points)} motor set-points [{robot.motors.unit}] -> "
+        f"{', '.join(robot.outputs.names)} [{robot.outputs.display_unit}]",
+        _without_sources(KINDS[model.kind].summary, block),
+        f"{1e3 * model.sample_time:g} ms",
+        f"dead time {dead} s" if dead else "",
+        f"simulation fit {'/'.join(map(percent, fits.values()))} % on rows held out" if fits else "",
+    ]
+    return "; ".join(filter(None, said))
+
+
+def _without_sources(text: str, block: Block) -> str:
+    """Return the first line of a text without the numbers of the paper's equations and sections."""
+    line = text.splitlines()[0] if text else block.kind
+    return re.sub(r" \((?:Eq\.|section) [^)]*\)", "", line)
 
 
 def _fits(validation: Validation) -> str:
