@@ -246,7 +246,9 @@ def _only_exchange(path: Path, target: Path, more: tuple[bytes, bytes] = (b"", b
         for name in old.namelist():
             data = old.read(name)
             if name == "modelDescription.xml":
-                data = re.sub(rb"<CoSimulation [^>]*(?:/>|>.*?</CoSimulation>)", b"", data, flags=re.DOTALL).replace(*more)
+                data = re.sub(rb"<CoSimulation [^>]*(?:/>|>.*?</CoSimulation>)", b"", data, flags=re.DOTALL).replace(
+                    *more
+                )
             new.writestr(name, data)
     return target
 
