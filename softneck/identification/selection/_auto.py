@@ -32,7 +32,7 @@ from ..uncertainty._guarded import BASES, OF, Guarded, fitted_base
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
 from ._examination import HOLD_OUT, SECOND, SHORT, Examination, Fits, other_motion, second_training, unseen_rows
-from ._left_out import Fold, agreement, all_rows, exams, folds, free_runs
+from ._left_out import Fold, agreement, all_rows, exams, folds, free_runs, samples_to_judge
 
 EXAM, COLD = "agreement", "cold start"
 # What is in a model file but was not found from data: sizes, tables, copies of rows in another order; and what says how
@@ -247,9 +247,14 @@ def choose(
         progress: called with the part done and a word on it.
 
     Raises:
-        DataError: no kind could be identified.
+        DataError: no kind could be identified, or too little is held out to judge by.
     """
     wanted = _kinds_in_order(kinds)
+    for name, samples in zip(train.robot.outputs.names, samples_to_judge(hold_out), strict=True):
+        if samples < 2:
+            raise DataError(
+                f"`{name}` has {samples} sample(s) in the rows held out, too few to judge by. Record longer."
+            )
     race = _Race(train, hold_out, folds(train, hold_out, other_excitation=other_excitation), seed)
     for number, kind in enumerate(wanted):
         progress(0.7 * number / len(wanted), _progress_text(kind, list(race.tried.values())))

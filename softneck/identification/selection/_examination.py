@@ -169,7 +169,9 @@ _SAME_MOTION = 1.25
 
 def other_motion(recording: Recording) -> bool:
     """Return whether the runs are of different motions."""
-    runs = recording.runs()
-    sizes = np.array([[run.set_points.std(axis=0), np.diff(run.set_points, axis=0).std(axis=0)] for run in runs])
+    moves = [run.set_points for run in recording.runs() if len(run) > 1]
+    if not moves:
+        return False
+    sizes = np.array([[U.std(axis=0), np.diff(U, axis=0).std(axis=0)] for U in moves])
     low, high = sizes.min(axis=0), sizes.max(axis=0)
     return bool((high > _SAME_MOTION * low + 1e-9 * high.max()).any())

@@ -160,6 +160,11 @@ def all_rows(name: str, recording: Recording) -> Judged:
     return Judged(name, recording, _scored_rows(recording))
 
 
+def samples_to_judge(recording: Recording) -> list[int]:
+    """Return how many samples of each output `all_rows` scores."""
+    return np.isfinite(recording.outputs[_scored_rows(recording)]).sum(axis=0).tolist()
+
+
 def _scored_rows(recording: Recording) -> np.ndarray:
     """Return (time,) whether a row is after the warm-up of its run."""
     return np.concatenate([np.arange(len(run)) >= WARM_UP for run in recording.runs()])
