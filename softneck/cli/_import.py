@@ -321,19 +321,20 @@ def _of_robot(
 
     proposal = job.beside(".layout.toml")
     facts: dict[str, Any] = {"layout_file": str(proposal)}
-    remarks: dict[str, str] = {}
     if propose:
         if robot_out is not None:
             refuse_existing(robot_out, force=job.force)
         whose = robot if known and job.named is not None else None
         found = signals.guess_robot(job.log, job.named, robot=whose, sample_time=job.clock)
-        remarks[found.robot.set_points[0]] = found.remark
-        facts["reasons"] = list(found.lines)
-        for line in found.lines:
-            note(line)
-        layout = found.layout
     else:
-        layout = signals.layout_for(job.log, robot, sample_time=job.clock)
+        found = signals.layout_for(job.log, robot, sample_time=job.clock)
+    for line in found.lines:
+        note(line)
+    facts |= {"reasons": list(found.lines), "doubts": [doubt.as_dict() for doubt in found.doubts]}
+    layout, remarks = found.layout, {}
+    for doubt in found.doubts:
+        said = remarks.get(doubt.channels[0])
+        remarks[doubt.channels[0]] = f"{said}; NOT SURE: {doubt}" if said else f"NOT SURE: {doubt}"
     if robot_out is not None or layout.robot.hash != find_robot(job.robot, beside=job.log).hash:
         file = robot_out or job.beside(".robot.toml")
         force = job.replace if robot_out is None else job.force

@@ -13,7 +13,6 @@ from ._checks import require_one_of as require_one_of
 from ._checks import require_positive as require_positive
 from ._checks import require_whole as require_whole
 from ._checks import silent as silent
-from ._checks import to_si as to_si
 from ._errors import CheckFailedError as CheckFailedError
 from ._errors import DataError as DataError
 from ._errors import FileFormatError as FileFormatError
@@ -28,6 +27,7 @@ from ._kinds import Kind as Kind
 from ._kinds import find_kind as find_kind
 from ._kinds import load as load
 from ._kinds import resolve as resolve
+from ._units import to_si as to_si
 
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
@@ -39,7 +39,6 @@ from ._certificate import certificate_contents as certificate_contents
 from ._certificate import certificate_path as certificate_path
 from ._certificate import required_rows as required_rows
 from ._certificate import sim_name as sim_name
-from ._checks import SI_BASES as SI_BASES
 from ._checks import finite_matrix as finite_matrix
 from ._checks import finite_vector as finite_vector
 from ._display import ReprMixin as ReprMixin
@@ -69,3 +68,6 @@ from ._kinds import make_settings as make_settings
 from ._metrics import METRICS as METRICS
 from ._metrics import metric_of as metric_of
 from ._metrics import worst as worst
+from ._units import AMBIGUOUS as AMBIGUOUS
+from ._units import SI_BASES as SI_BASES
+from ._units import spelled_unit as spelled_unit

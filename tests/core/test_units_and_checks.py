@@ -10,12 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import (
+    SI_BASES,
     DataError,
     SettingsError,
+    _units,
     require_between,
     require_finite,
     require_one_of,
     require_positive,
+    spelled_unit,
     to_si,
 )
 from softneck.core._checks import finite_vector
@@ -29,6 +32,28 @@ def test_a_unit_has_its_si_unit_and_factor(unit: str, si: str, factor: float) ->
     assert to_si(unit) == (factor, si)
     # An SI unit is its own: converting twice changes nothing.
     assert to_si(si) == (1.0, si)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [("mPa", "MPa"), ("MPa", "MPa"), ("mN", "mN"), ("µs", "us"), ("μm", "um"), ("GRAD/s", "deg/s"), ("°", "deg"),
+     ("Nm", "Nm"), ("rev", "turns"), ("KPA", "kPa"), ("bar/s", "bar/s"),
+     ("foo", None), ("", None), ("foo/s", None), ("c", None)],
+)  # fmt: skip
+def test_a_spelling_of_logs_is_one_unit_or_none(text: str, unit: str | None) -> None:
+    assert spelled_unit(text) == unit
+
+
+def test_every_unit_spells_itself_and_no_spelling_is_of_two_units() -> None:
+    words = [word for _, _, others in _units._UNITS.values() for word in others.split()]
+    assert len(set(words)) == len(words)
+    assert not set(words) & {unit.lower() for unit in _units._UNITS}
+    for unit in _units._UNITS:
+        assert spelled_unit(unit) == unit
+        factor, si = to_si(unit)
+        assert factor > 0.0
+        assert to_si(si) == (1.0, si)
+        assert si in SI_BASES
 
 
 @given(value=st.floats(-1e6, 1e6), unit=st.sampled_from([pair[0] for pair in PAIRS]))

@@ -142,6 +142,29 @@ def test_a_log_without_a_clock_takes_the_sample_time_that_is_answered(tmp_path: 
     assert told.missing == ()
     assert parse_layout(told.text) == told.layout
     assert import_log(path, told.layout).recording.sample_time == 0.02
+    assert told.doubts == guess.doubts
+
+
+def test_a_sample_time_that_is_answered_is_doubted_where_a_column_may_be_a_clock(tmp_path: Path) -> None:
+    path = log(tmp_path, motors=3.0, platform=20.0)
+    frame = pd.read_csv(path)
+    frame["time"] = [f"row {k}" for k in range(len(frame))]
+    frame.to_csv(path, index=False)
+    told = guess_layout(path).with_sample_time(0.02)
+    assert [(doubt.about, doubt.taken) for doubt in told.doubts] == [("sample time", "20 ms as given")]
+    assert "column 'time' was not recognised as a clock" in told.doubts[0].why
+    path.with_suffix(".toml").write_text(told.text, encoding="utf-8")
+    assert any("sample time: 20 ms as given (60 % sure)" in line for line in doubts_in(path.with_suffix(".toml")))
+
+
+def test_grad_is_doubted_with_gon_beside_it_unless_the_log_is_german(tmp_path: Path) -> None:
+    path = log(tmp_path, motors=115.0, platform=20.0, header=" [grad]")
+    (doubt,) = guess_layout(path).doubts
+    assert (doubt.taken, "gon" in doubt.choices) == ("deg", True)
+    other = guess_layout(path).settle_doubt(doubt, "gon")
+    assert other.layout.channels["motor_setpoint_1"].unit == "gon"
+    path.write_text(path.read_text().replace("target", "Sollwert Motor "), encoding="utf-8")
+    assert guess_layout(path).doubts == ()
 
 
 def test_references_in_another_unit_than_the_angles_do_not_change_theirs_and_are_doubted(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from softneck import import_log
 from softneck.core import DataError, SettingsError, Vector
 from softneck.signals import columns_line, is_of_another_robot
-from softneck.signals.importing._robot_guess import NamedColumns, RobotGuess, guess_robot
+from softneck.signals.importing._robot_guess import NamedColumns, RobotGuess, guess_robot, layout_for
 
 ROWS = 400
 
@@ -198,6 +198,60 @@ def test_a_log_without_titles_offers_the_line_that_reads_it(tmp_path: Path) -> N
     guess = guess_robot(path, NamedColumns(motors=("0-1",)), sample_time=0.02)
     assert [term.column for source in guess.layout.channels.values() for term in source.terms] == [0, 1, 2, 3]
     assert "left out: 4: the rate of 2" in guess.lines
+
+
+@pytest.mark.parametrize(
+    ("motor", "output", "taken_units", "doubted"),
+    [("Nm", "mm", ("Nm", "mm"), []), ("%", "mm", ("%", "mm"), ["unit `%`"]),
+     ("V", "grad", ("V", "deg"), ["unit `grad`"]), ("nm", "gon", ("Nm", "gon"), ["unit `nm`"]),
+     ("pct", "rev", ("%", "turns"), ["unit `pct`"]),
+     ("foo", "µm", ("1", "um"), ["unit `foo`"])],
+)  # fmt: skip
+def test_units_of_a_robot_are_those_of_the_titles_and_doubted_where_they_are_ambiguous(
+    tmp_path: Path, motor: str, output: str, taken_units: tuple[str, str], doubted: list[str]
+) -> None:
+    guess = guess_robot(
+        write(tmp_path / "log.csv", {"time [s]": TIME, f"cmd [{motor}]": A, f"flexion [{output}]": ONE})
+    )
+    assert (guess.robot.motors.unit, guess.robot.outputs.unit) == taken_units
+    assert [doubt.about for doubt in guess.doubts] == ["robot", *doubted]
+
+
+@pytest.mark.parametrize(("title", "numbers", "doubted"), [("min", 1.0 / 60.0, False), ("ms", 1.0, True)])
+def test_the_clock_of_any_robot_is_checked_against_its_title(
+    tmp_path: Path, title: str, numbers: float, doubted: bool
+) -> None:
+    columns = {f"time [{title}]": numbers * TIME, "cmd [V]": A, "x [mm]": ONE}
+    guess = guess_robot(write(tmp_path / "log.csv", columns))
+    # Six digits of minutes are written: a step is off by 2 %.
+    assert import_log(tmp_path / "log.csv", guess.layout).recording.sample_time == pytest.approx(0.02, rel=1e-3)
+    assert ["clock" in doubt.about for doubt in guess.doubts] == [False, *[True] * doubted]
+
+
+def test_a_unit_of_another_quantity_than_the_given_robots_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.csv", {"time [s]": TIME, "cmd [V]": A, "x [mm]": ONE})
+    robot = guess_robot(path).robot
+    wrong = write(tmp_path / "wrong.csv", {"time [s]": TIME, "cmd [bar]": A, "x [mm]": ONE})
+    with pytest.raises(DataError, match=r"wrong.csv: `cmd \[bar\]` is in bar; `cmd_setpoint` of robot `log`"):
+        guess_robot(wrong, robot=robot)
+
+
+def test_a_sample_time_beside_what_may_be_a_clock_is_doubted_by_the_columns_name(tmp_path: Path) -> None:
+    columns = {"stamp": TIME[::-1], "cmd [V]": A, "x [mm]": ONE}
+    path = write(tmp_path / "log.csv", columns)
+    guess = guess_robot(path, sample_time=0.02)
+    (doubt,) = guess.doubts[1:]
+    assert doubt.about == "sample time"
+    assert "'stamp' was not recognised as a clock" in doubt.why
+    titled = layout_for(path, guess.robot, sample_time=0.02)
+    assert titled.doubts == (doubt,)
+    clocked = write(tmp_path / "clock.csv", {"time": TIME, "cmd [V]": A, "x [mm]": ONE})
+    for say in (
+        lambda: guess_robot(clocked, sample_time=0.02),
+        lambda: layout_for(clocked, guess.robot, sample_time=0.02),
+    ):
+        with pytest.raises(SettingsError, match=r"has a clock, `time`; leave out --sample-time"):
+            say()
 
 
 @pytest.mark.parametrize(

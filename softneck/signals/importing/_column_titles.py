@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from softneck.core import AMBIGUOUS, spelled_unit, to_si
 
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|°")
 # Words without accents; those spelled as in English are not listed.
@@ -56,8 +59,7 @@ def words_of(title: str) -> list[str]:
     return found
 
 
-def is_german(title: str) -> bool:
-    """Return whether a title holds a German word; then `Grad` means degrees."""
+def _is_german(title: str) -> bool:
     words = [part for word in _WORD.findall(plain(title)) for part in _split(word)]
     return any(word in _GERMAN for word in words)
 
@@ -82,27 +84,10 @@ def _split(word: str) -> list[str]:
     return parts
 
 
-_UNITS = {
-    "deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad", "radians": "rad", "s": "s", "sec": "s",
-    "seconds": "s", "ms": "ms", "millis": "ms", "milliseconds": "ms", "us": "us", "µs": "us", "micros": "us",
-    "ns": "ns", "rad/s": "rad/s", "rad_s": "rad/s", "rads": "rad/s", "deg/s": "deg/s", "°/s": "deg/s", "rpm": "rpm",
-    "mm": "mm", "m": "m", "grad": "deg", "grados": "deg", "grado": "deg", "grad/s": "deg/s", "grados/s": "deg/s",
-    "radianes": "rad", "radiant": "rad", "rad/seg": "rad/s", "u/min": "rpm", "1/min": "rpm", "sek": "s",
-    "sekunden": "s", "seg": "s", "segundos": "s", "millisekunden": "ms", "milisegundos": "ms", "mikrosekunden": "us",
-    "microsegundos": "us", "nsec": "ns", "nanosec": "ns", "min": "min", "mins": "min", "minutes": "min",
-    "minuten": "min", "minutos": "min", "h": "h", "hr": "h", "hours": "h", "stunden": "h", "horas": "h", "d": "days",
-    "day": "days", "days": "days", "tage": "days", "dias": "days", "mrad": "mrad", "milliradians": "mrad",
-    "turn": "turns", "turns": "turns", "rev": "turns", "revs": "turns", "revolutions": "turns", "rotations": "turns",
-    "gon": "gon", "cdeg": "cdeg", "centidegrees": "cdeg", "mdeg": "mdeg", "arcmin": "arcmin", "arcsec": "arcsec",
-}  # fmt: skip
-# Units of quantities that are no angles: of drives, of other sensors, and shares of a range.
-_NO_ANGLES = {
-    "%", "pct", "percent", "prozent", "v", "mv", "volt", "volts", "a", "ma", "amp", "amps", "bar", "mbar", "pa", "kpa",
-    "mpa", "hpa", "psi", "atm", "mmhg", "n", "mn", "nm", "mnm", "kn", "kg", "g", "m", "mm", "cm", "um", "inch", "in",
-    "w", "hz", "m/s", "m/s2", "m/s^2", "c", "degc", "°c", "t", "mt", "gauss",
-}  # fmt: skip
-# Of these, words as well: a unit only in brackets.
-_WORDS_TOO = {"in", "ma", "pa", "mn", "kn", "mt", "um"}
+# Units that are words as well: only in brackets, and as the last word of no title.
+_WORDS_TOO = {"in", "ma", "pa", "mn", "kn", "mt", "um", "atm", "day", "tag"}
+#: Of temperatures, which no factor makes SI.
+TEMPERATURES = {"c", "degc", "°c", "degf", "°f", "f", "k"}
 # What stands where a unit would, and is none: an encoder's counts, numbers without a unit.
 _NO_UNITS = {"", "-", "1", "counts", "count", "ticks", "inc", "lsb", "raw", "a.u.", "au", "n/a"}
 # `_V` and `_kPa` at the end of a title; in lower case some are words.
@@ -148,7 +133,8 @@ class Title:
     """The meaning of a title.
 
     `role`: time, run, set-point, position, velocity, pitch, ..., ignored, or unknown. `family`: words without number
-    and unit; columns of the motors share it. `rank`: clarity of the reason; smaller is clearer.
+    and unit; columns of the motors share it. `unit`: as softneck writes it, None without one that is known, and
+    `written`: as the title does. `rank`: clarity of the reason; smaller is clearer.
     """
 
     role: str
@@ -157,38 +143,48 @@ class Title:
     unit: str | None
     why: str
     rank: int = 0
-    other: str = ""
+    written: str = ""
+
+    @property
+    def quantity(self) -> str:
+        """The unit's SI unit, "" without a unit that is known."""
+        return "" if self.unit is None else to_si(self.unit)[1]
 
 
 def read_title(title: str) -> Title:
     """Return the meaning of a column's title."""
-    text, unit, other = _without_unit(title.strip())
+    text, written = _without_unit(title.strip())
     words = words_of(text)
     numbers = [int(word) for word in words if word.isdigit() and len(word) < 4]
     names = [word for word in words if not word.isdigit()]
-    if unit is None and len(names) > 1 and names[-1] in _UNITS and len(names[-1]) > 1:
-        unit = _UNITS[names.pop()]
-    if unit is None and not other and len(names) > 1 and names[-1] in _NO_ANGLES - _WORDS_TOO and len(names[-1]) > 1:
-        other = names.pop()
+    if not written and len(names) > 1 and len(names[-1]) > 1 and spelled_unit(names[-1]):
+        written = "" if names[-1] in _WORDS_TOO else names.pop()
     motor = numbers[-1] if numbers else None
     role, why, rank = _role(names, motor)
-    if unit in ("mm", "m"):
-        unit, other = None, unit
-    if other.lower() in _NO_ANGLES and role not in ("time", "run", "ignored", "unknown", "velocity"):
-        return Title("ignored", " ".join(names), motor, None, f"{other} is no unit of an angle", rank, other)
-    if role == "time" and unit is None and names and names[-1] in _UNITS and names[-1] != "m":
-        unit = _UNITS[names[-1]]
-    return Title(role, " ".join(names), motor, unit, why, rank, other)
+    unit = spelled_unit(written) or spelled_unit(plain(written))
+    if role == "time" and not written and (last := spelled_unit(names[-1])) and to_si(last)[1] == "s":
+        unit = last
+    found = Title(role, " ".join(names), motor, unit, why, rank, written)
+    other = plain(written) in TEMPERATURES or found.quantity not in ("", "rad", "rad/s")
+    if other and role not in ("time", "run", "ignored", "unknown", "velocity"):
+        return replace(found, role="ignored", why=f"{written} is no unit of an angle")
+    return found
 
 
-def _without_unit(title: str) -> tuple[str, str | None, str]:
-    """Return a title without its unit, the unit if it is one of time or angle, and the text of another."""
+def ambiguity(title: Title, titles: Iterable[str | int]) -> str:
+    """Return what the unit of a title leaves open beside the other `titles` of its log; "" where nothing."""
+    if title.written == title.unit != "%" or (title.unit == "deg" and any(map(_is_german, map(str, titles)))):
+        return ""
+    return AMBIGUOUS.get(title.written.lower().removesuffix("/s")) or AMBIGUOUS.get(title.unit or "", "")
+
+
+def _without_unit(title: str) -> tuple[str, str]:
+    """Return a title without its unit, and the unit as it is written."""
     match = _BRACKET.search(title) or _SLASH.search(title) or _CAPITAL.search(title)
     if match is None or _INDEX.fullmatch(match[1].strip()):
-        return title, None, ""
+        return title, ""
     text = match[1].strip()
-    unit = _UNITS.get(plain(text), _UNITS.get(text.lower()))
-    return title[: match.start()], unit, text if unit is None and text not in _NO_UNITS else ""
+    return title[: match.start()], "" if text in _NO_UNITS else text
 
 
 def _role(words: list[str], motor: int | None) -> tuple[str, str, int]:

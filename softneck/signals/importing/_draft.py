@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
-from softneck.core import Matrix, Vector
+from softneck.core import Matrix, Vector, to_si
 
 from ..recording._channels import MOTOR_POSITIONS, OUTPUTS, SET_POINTS, known_channels
 from ..recording._wraps import unwrap
 from ._clocks import pitch_roll
-from ._column_titles import COUNTS_ROWS, Title, is_german, plain, read_title
+from ._column_titles import COUNTS_ROWS, Title, ambiguity
 from ._layout import Column, Quaternion, Term
 from ._table_format import SniffResult
 
+#: Below this confidence a decision is asked about, or marked.
+SURE = 0.9
 # Enough rows for a decision, whatever the length of the log.
 _MAX_ROWS = 20_000
-# A full turn in the units of titles, and roles whose jumps mean something else.
-_TURNS = {"deg": 360.0, "rad": 2.0 * np.pi, "mrad": 2e3 * np.pi, "turns": 1.0, "gon": 400.0, "cdeg": 36e3,
-          "mdeg": 36e4, "arcmin": 21_600.0, "arcsec": 1_296_000.0}  # fmt: skip
+# Roles whose jumps mean something else.
 _NEVER_WRAPPED = ("time", "run", "set-point", "ignored", "orientation")
 
 
@@ -37,12 +37,41 @@ def take_moving_rows(columns: Mapping[Column, Vector]) -> dict[Column, Vector]:
 
 
 @dataclass(frozen=True, slots=True)
+class Doubt:
+    """One uncertain decision.
+
+    `about`: subject, in words. `taken`: the choice made. `confidence`: probability that it is right, 0 to 1. `choices`:
+    alternatives for `settle_doubt`; without any, the columns have to be edited in the layout.
+    """
+
+    about: str
+    channels: tuple[str, ...]
+    taken: str
+    confidence: float
+    why: str
+    choices: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        """Return one line: the choice, its confidence and its reason."""
+        return f"{self.about}: {self.taken} ({percent(self.confidence)} sure): {self.why}"
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the JSON values."""
+        return {**asdict(self), "confidence": round(self.confidence, 3)}
+
+
+def percent(confidence: float) -> str:
+    """Return a probability in %, without decimals."""
+    return f"{100.0 * confidence:.0f} %"
+
+
+@dataclass(frozen=True, slots=True)
 class Pick:
     """The columns chosen for one channel.
 
     `terms`: of a weighted sum of columns. `unit`: named by the title, or None. `confidence`: probability that the
-    columns are right, by names and data. `unit_sure`: whether the title's unit is unambiguous: `Grad` means degrees in
-    German. `integrate`: whether the columns are rates to integrate.
+    columns are right, by names and data. `ambiguous`: what the title's unit leaves open, or "". `integrate`: whether
+    the columns are rates to integrate.
     """
 
     terms: tuple[Term, ...]
@@ -50,7 +79,7 @@ class Pick:
     unit: str | None = None
     sign: float = 1.0
     confidence: float = 0.97
-    unit_sure: bool = True
+    ambiguous: str = ""
     integrate: bool = False
 
 
@@ -68,12 +97,7 @@ class Draft:
     passed_over: dict[Column, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        units = self.sniffed.units
-        self.titles = {
-            name: read_title(f"{name} [{units[name]}]" if name in units else name)
-            for name in self.sniffed.columns
-            if isinstance(name, str)
-        }
+        self.titles = {name: self.sniffed.title(name) for name in self.sniffed.columns if isinstance(name, str)}
         self.moving = take_moving_rows({name: self._continuous(name) for name in self.sniffed.columns})
         for name, title in self.titles.items():
             if title.why == COUNTS_ROWS and name in self.moving and not (np.diff(self.moving[name]) == 1.0).all():
@@ -84,8 +108,8 @@ class Draft:
         values, title = self.sniffed.columns[name][:_MAX_ROWS], self.titles.get(name)
         if title is not None and title.role in _NEVER_WRAPPED:
             return values
-        named = None if title is None else _TURNS.get(title.unit or "")
-        for turn in (360.0, 2.0 * np.pi) if named is None else (named,):
+        angle = to_si(title.unit)[0] if title is not None and title.unit and title.quantity == "rad" else None
+        for turn in (360.0, 2.0 * np.pi) if angle is None else (2.0 * np.pi / angle,):
             unwrapped, jumps = unwrap(values, np.zeros(values.size), turn)
             if jumps:
                 return unwrapped
@@ -93,10 +117,10 @@ class Draft:
 
     def pick(self, channel: str, column: Column, why: str, *, sign: float = 1.0, confidence: float = 0.97) -> None:
         """Take one column for a channel."""
-        title = self.titles.get(column)
-        sure = "grad" not in plain(str(column)).replace("grados", "") or any(map(is_german, map(str, self.titles)))
-        unit = title.unit if title else None
-        self.picks[channel] = Pick((Term(column),), why, unit, sign, confidence, sure)
+        title, unit, ambiguous = self.titles.get(column), None, ""
+        if title is not None and title.quantity in (("s",) if channel == "time" else ("rad", "rad/s")):
+            unit, ambiguous = title.unit, ambiguity(title, self.titles)
+        self.picks[channel] = Pick((Term(column),), why, unit, sign, confidence, ambiguous)
 
     def used_columns(self) -> set[Column]:
         """Return all columns in use."""

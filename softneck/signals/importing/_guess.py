@@ -3,60 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from softneck.core import DataError, ReprMixin, SettingsError
+from softneck.core import AMBIGUOUS, DataError, ReprMixin, SettingsError, to_si
 from softneck.robot import Robot
 
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, NECK, OUTPUTS, SET_POINTS, redefine
 from ..recording._resampling import jitter
 from ._clocks import SampleTime, estimate_sample_time
-from ._draft import Draft, column_label
+from ._draft import SURE, Doubt, Draft, column_label, percent
 from ._guess_names import by_names, drop_or_turn_quaternion, one_axis, use_positions_as_inputs
 from ._guess_shapes import by_shapes, max_correlation
-from ._guess_units import Unit, nominal_step, units
+from ._guess_units import Unit, nominal_step, units, unread_clocks
 from ._layout import ONE_AXIS, Column, Layout, Source, Term, layout_toml
 from ._odd_clocks import double_stamps, mean_of_steps, rows_of_stamp
-from ._table_format import sniff
+from ._table_format import SniffResult, sniff
 
-#: Below this confidence a decision is asked about, or marked.
-SURE = 0.9
 _TILT = (*OUTPUTS, "inclination", "orientation", "pitch_reference", "roll_reference")
 _GROUPS = {"motor set-points": SET_POINTS, "motor positions": MOTOR_POSITIONS, "motor velocities": MOTOR_VELOCITIES}
 # However strong the correlation, a sign that contradicts the titles deserves a question.
 _MOST_SURE = 0.89
-
-
-@dataclass(frozen=True, slots=True)
-class Doubt:
-    """One uncertain decision.
-
-    `about`: subject, in words. `taken`: the choice made. `confidence`: probability that it is right, 0 to 1. `choices`:
-    alternatives for `settle_doubt`; without any, the columns have to be edited in the layout.
-    """
-
-    about: str
-    channels: tuple[str, ...]
-    taken: str
-    confidence: float
-    why: str
-    choices: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        """Return one line: the choice, its confidence and its reason."""
-        return f"{self.about}: {self.taken} ({percent(self.confidence)} sure): {self.why}"
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the JSON values."""
-        return {**asdict(self), "confidence": round(self.confidence, 3)}
-
-
-def percent(confidence: float) -> str:
-    """Return a probability in %, without decimals."""
-    return f"{100.0 * confidence:.0f} %"
 
 
 def doubts_of(draft: Draft, found: dict[str, Unit]) -> list[Doubt]:
@@ -96,6 +65,7 @@ def _unit_doubts(draft: Draft, found: dict[str, Unit]) -> list[Doubt]:
         unit = min((found[name] for name in names), key=lambda one: one.confidence)
         rate = "/s" if unit.name.endswith("/s") else ""
         choices = ("s", "ms") if about == "time" else (f"rad{rate}", f"deg{rate}")
+        choices += (f"gon{rate}",) if unit.why == AMBIGUOUS["grad"] else ()
         other = tuple(choice for choice in choices if choice != unit.name)
         doubts.append(Doubt(f"unit of {about}", names, unit.name, unit.confidence, unit.why, other))
     return doubts
@@ -164,6 +134,7 @@ class Guess(ReprMixin):
     doubts: tuple[Doubt, ...] = ()
     _remarks: Mapping[str, str] = field(default_factory=dict, repr=False)
     _head: str = field(default="", repr=False)
+    _table: SniffResult | None = field(default=None, repr=False, compare=False)
 
     def settle_doubt(self, doubt: Doubt, choice: str | None = None) -> Guess:
         """Return the guess with one doubt settled: the choice made, or another.
@@ -177,10 +148,13 @@ class Guess(ReprMixin):
         return self._rewrite(layout, remarks, self.missing, tuple(one for one in self.doubts if one is not doubt))
 
     def with_sample_time(self, sample_time: float) -> Guess:
-        """Return the guess of a log without a clock with its sample time [s]."""
+        """Return the guess of a log without a clock with its sample time [s], and a doubt for what may be one."""
         missing = tuple(line for line in self.missing if not line.startswith(_NO_CLOCK))
-        remarks = {**self._remarks, "sample_time": "as you answered"}
-        return self._rewrite(replace(self.layout, sample_time=sample_time), remarks, missing, self.doubts)
+        doubts = () if self._table is None else unread_clocks(self._table, sample_time)
+        remarks = {**self._remarks, "sample_time": "; ".join(["as given", *(f"NOT SURE: {one}" for one in doubts)])}
+        guess = replace(self, lines=(*self.lines, *(f"not sure: {doubt}" for doubt in doubts)))
+        layout = replace(self.layout, sample_time=sample_time)
+        return guess._rewrite(layout, remarks, missing, (*doubts, *self.doubts))
 
     def _rewrite(
         self, layout: Layout, remarks: Mapping[str, str], missing: tuple[str, ...], doubts: tuple[Doubt, ...]
@@ -251,7 +225,7 @@ def _guess(path: Path, neck: Robot) -> Guess:
     lines += [f"not sure: {doubt.why} ({percent(doubt.confidence)} sure of {doubt.taken})" for doubt in clock_doubts]
     lines += [*check_lines, *_left_out(draft)]
     head = f"# Proposed by `softneck import --guess` for {path.name!r}; edit it.\n\n"
-    guess = Guess(layout, "", tuple(lines), missing, tuple(doubts), remarks, head)
+    guess = Guess(layout, "", tuple(lines), missing, tuple(doubts), remarks, head, sniffed)
     return guess._rewrite(layout, remarks, missing, guess.doubts)
 
 
@@ -324,7 +298,6 @@ def _choose_clock(draft: Draft, found: dict[str, Unit], layout: Layout) -> tuple
 
 
 _STEP_TITLES = {"dt", "delta t", "deltat", "ts", "sample time", "time step", "timestep", "step s", "period", "interval"}
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 
 
 def _counted_rows(draft: Draft, found: dict[str, Unit]) -> tuple[float, str, float] | None:
@@ -341,7 +314,7 @@ def _counted_rows(draft: Draft, found: dict[str, Unit]) -> tuple[float, str, flo
         )
     for column, title in draft.titles.items():
         values = draft.sniffed.columns[column]
-        scale = _SECONDS.get(title.unit or "s", 1.0)
+        scale = to_si(title.unit)[0] if title.unit and title.quantity == "s" else 1.0
         if (title.family in _STEP_TITLES or str(column).lower() in _STEP_TITLES) and (mean := mean_of_steps(values)):
             if title.unit is None and not _FASTEST_S < mean < _SLOWEST_S:
                 scale = 1e-3
@@ -359,8 +332,7 @@ _FASTEST_S, _SLOWEST_S = 1e-5, 2.0
 
 def _estimate_from_rates(draft: Draft, found: dict[str, Unit]) -> SampleTime | None:
     names = [name for name in (*MOTOR_POSITIONS, *MOTOR_VELOCITIES) if name in draft.picks]
-    factors = {"deg": np.pi / 180, "deg/s": np.pi / 180, "rpm": np.pi / 30}
-    channels = {name: factors.get(found[name].name, 1.0) * draft.values(name) for name in names}
+    channels = {name: found[name].si * draft.values(name) for name in names}
     try:
         return estimate_sample_time(channels, draft.runs())
     except DataError:

@@ -10,10 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from softneck.core import Vector, to_si
+
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_TURNS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS, file_unit
 from ._clocks import velocity_period
-from ._draft import Draft
-from ._odd_clocks import is_serial_days
+from ._draft import Doubt, Draft, column_label
+from ._odd_clocks import is_serial_days, rises
+from ._table_format import SniffResult
 from .formats._text import DATE
 
 _DEGREE = pi / 180.0
@@ -104,18 +107,13 @@ _USUAL_STEP_S, _STEP_SPREAD = 0.02, 1.2
 _FAR_STEP, _STEP_BOUNDS_S = 50.0, (0.99e-4, 600.0)
 # What a clock's numbers may be, times what the title says: s for ms, us or min, and the other way round.
 _OTHER_READINGS = (1e3, 1e-3, 1e6, 1e-6, 60.0, 1.0 / 60.0)
-# Unit in the title of a time column -> unit `s` or `ms` of the layout, and factor.
-_CLOCKS = {"s": ("s", 1.0), "ms": ("ms", 1.0), "us": ("ms", 1e-3), "ns": ("ms", 1e-6)}
-# The same of units that only a title can name.
-_TITLED_CLOCKS = {**_CLOCKS, "min": ("s", 60.0), "h": ("s", 3600.0), "days": ("s", 86400.0)}
-# Unit of an angle in a title -> unit of the layout, and factor.
-_TITLED_ANGLES = {"mrad": ("rad", 1e-3), "turns": ("rad", 2.0 * pi), "gon": ("rad", pi / 200.0), "cdeg": ("deg", 1e-2),
-                  "mdeg": ("deg", 1e-3), "arcmin": ("deg", 1.0 / 60.0), "arcsec": ("deg", 1.0 / 3600.0)}  # fmt: skip
+# Of a clock whose title names none; minutes and more only a title can name.
+_CLOCKS = ("s", "ms", "us", "ns")
 # Largest confidence, since robots differ more than the prior; the same if set-points and positions have two units.
 _MAX_CONFIDENCE, _SEPARATE_CONFIDENCE = 0.99, 0.85
 # Ratio of pitch to roll that makes their unit doubtful, and its confidence.
 _DOUBTFUL_RATIO, _DOUBTFUL_CONFIDENCE = 20.0, 0.6
-_DAYS_CONFIDENCE = 0.95
+_DAYS_CONFIDENCE, _AMBIGUOUS_CONFIDENCE = 0.95, 0.8
 # References and angles have two units if they differ by more than half of the factor 57, in logarithms. Positions that
 # follow set-points this well and are so many times larger or smaller are counts, turns, or before a gear, unless the
 # ratio is near 57.
@@ -130,14 +128,19 @@ class Unit(NamedTuple):
     why: str
     confidence: float = 1.0
 
+    @property
+    def si(self) -> float:
+        """The factor to SI."""
+        return self.factor * to_si(self.name)[0]
+
 
 def units(draft: Draft) -> dict[str, Unit]:
     """Return the unit of each pick."""
     found: dict[str, Unit] = {}
     for channel, pick in draft.picks.items():
         if pick.unit is not None and channel not in ("time", "run"):
-            sure = 1.0 if pick.unit_sure else 0.8
-            found[channel] = Unit(*_TITLED_ANGLES.get(pick.unit, (pick.unit, 1.0)), "its title says so", sure)
+            sure = _AMBIGUOUS_CONFIDENCE if pick.ambiguous else 1.0
+            found[channel] = Unit(pick.unit, 1.0, pick.ambiguous or "its title says so", sure)
     _time(draft, found)
     counts = _counts(draft, found)
     _angles(draft, found, counted=counts is not None)
@@ -150,8 +153,8 @@ def units(draft: Draft) -> dict[str, Unit]:
             found[channel] = Unit(file_unit(channel), 1.0, "the usual unit", 0.9)
     for channel, pick in draft.picks.items():
         title = draft.titles.get(pick.terms[0].column)
-        if title is not None and title.other and pick.unit is None and channel in found:
-            why = f"its title names `{title.other}`, which is no known unit; {found[channel].why}"
+        if title is not None and title.written and pick.unit is None and channel in found:
+            why = f"its title names `{title.written}`, which is no known unit of it; {found[channel].why}"
             found[channel] = found[channel]._replace(
                 why=why, confidence=min(found[channel].confidence, _DOUBTFUL_CONFIDENCE)
             )
@@ -169,45 +172,54 @@ def largest(draft: Draft, channel: str, step: float = 1.0) -> float:
 
 
 def _time(draft: Draft, found: dict[str, Unit]) -> None:
-    if "time" not in draft.picks:
-        return
-    column = draft.picks["time"].terms[0].column
-    if column in draft.sniffed.dates:
-        found["time"] = Unit(DATE, 1.0, "it holds dates or times of day")
-        return
-    unit = draft.picks["time"].unit
-    if unit is not None:
-        found["time"] = Unit(*_TITLED_CLOCKS.get(unit, (unit, 1.0)), f"its title says {unit}")
-        _doubt_clock(found, nominal_step(draft, found))
-        return
-    if is_serial_days(draft.values("time")):
-        why = "it counts days, as a spreadsheet or `datenum` does (a day has 86,400 s)"
-        found["time"] = Unit("s", 86400.0, why, _DAYS_CONFIDENCE)
-        return
-    step = np.diff(draft.values("time"))
+    if "time" in draft.picks:
+        pick = draft.picks["time"]
+        dates = pick.terms[0].column in draft.sniffed.dates
+        found["time"] = Unit(DATE, 1.0, "it holds dates or times of day") if dates else clock_unit(
+            draft.values("time"), pick.unit
+        )  # fmt: skip
+
+
+def clock_unit(values: Vector, titled: str | None) -> Unit:
+    """Return the unit of a clock (time,) whose title names the unit `titled` or none."""
+    step = np.diff(values)
     typical = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
+    if titled is not None:
+        return _doubted_clock(Unit(titled, 1.0, f"its title says {titled}"), typical)
+    if is_serial_days(values):
+        why = "it counts days, as a spreadsheet or `datenum` does (a day has 86,400 s)"
+        return Unit("days", 1.0, why, _DAYS_CONFIDENCE)
     odds = {
-        name: exp(
-            -0.5
-            * (log(max(typical, 1e-300) * factor * (1e-3 if unit == "ms" else 1.0) / _USUAL_STEP_S) / _STEP_SPREAD) ** 2
-        )
-        for name, (unit, factor) in _CLOCKS.items()
+        name: exp(-0.5 * (log(max(typical, 1e-300) * to_si(name)[0] / _USUAL_STEP_S) / _STEP_SPREAD) ** 2)
+        for name in _CLOCKS
     }
     name = max(odds, key=lambda key: odds[key])
     sure = min(odds[name] / sum(odds.values()), _MAX_CONFIDENCE) if sum(odds.values()) > 0.0 else 0.5
-    why = f"its steps of {typical:.4g} are a sample time only in {name}"
-    found["time"] = Unit(*_CLOCKS[name], why, sure)
+    return Unit(name, 1.0, f"its steps of {typical:.4g} are a sample time only in {name}", sure)
 
 
-def _doubt_clock(found: dict[str, Unit], step: float) -> None:
-    """Doubt a title whose sample time `step` [s] is far from usual; take another reading if it is impossible."""
+def _doubted_clock(unit: Unit, typical: float) -> Unit:
+    """Doubt a title whose sample time is far from usual; take another reading if it is impossible."""
+    step = max(typical * unit.si, 1e-9)
     if _USUAL_STEP_S / _FAR_STEP <= step <= _USUAL_STEP_S * _FAR_STEP:
-        return
+        return unit
     times = min(_OTHER_READINGS, key=lambda times: abs(log(times * step / _USUAL_STEP_S)))
-    name, factor, *_ = found["time"]
     a, b, possible = 1e3 * step, 1e3 * times * step, _STEP_BOUNDS_S[0] <= step <= _STEP_BOUNDS_S[1]
     why = f"title and numbers disagree: {a:.4g} ms a sample, or {b:.4g} ms with numbers {times:.4g} times as large"
-    found["time"] = Unit(name, factor * (1.0 if possible else times), why, _DOUBTFUL_CONFIDENCE)
+    return Unit(unit.name, 1.0 if possible else times, why, _DOUBTFUL_CONFIDENCE)
+
+
+def unread_clocks(table: SniffResult, sample_time: float) -> list[Doubt]:
+    """Return a doubt about a sample time [s] that a user gave for each column that may be a clock all the same."""
+    said = {column: "its title names time" for column in (*table.words, *table.columns)
+            if (title := table.title(column)).role == "time" or title.quantity == "s"}  # fmt: skip
+    said |= {column: "it rises from row to row" for column, values in table.columns.items()
+             if column not in said and rises(values)}  # fmt: skip
+    return [
+        Doubt("sample time", ("sample_time",), f"{1e3 * sample_time:.6g} ms as given", _DOUBTFUL_CONFIDENCE,
+              f"{column_label(column)} was not recognised as a clock, and {why}; if it is one, write it into [time]")
+        for column, why in said.items()
+    ]  # fmt: skip
 
 
 def _angles(draft: Draft, found: dict[str, Unit], *, counted: bool) -> None:
@@ -220,15 +232,12 @@ def _angles(draft: Draft, found: dict[str, Unit], *, counted: bool) -> None:
     }
     groups = {group: names for group, names in groups.items() if names}
     step = nominal_step(draft, found)
-    factors = {name: unit.factor for name, unit in found.items()}
-    reaches = {group: max(factors.get(name, 1.0) * largest(draft, name, step) for name in names)
-               for group, names in groups.items()}  # fmt: skip
+    reaches = {group: max(_reach(draft, found, name, step) for name in names) for group, names in groups.items()}
     summed = {group for group, names in groups.items() if draft.picks[names[0]].integrate}
-    titled: dict[str, str] = {}
-    for group, names in groups.items():
-        named = {found[name].name.removesuffix("/s") for name in names if name in found} & {"rad", "deg"}
-        if len(named) == 1:
-            titled[group] = named.pop()
+    named = {group: {found[name].name.removesuffix("/s") for name in names if name in found}
+             for group, names in groups.items()}  # fmt: skip
+    alike = {group: names.pop() for group, names in named.items() if len(names) == 1}
+    titled = {group: "deg" if name == "deg" else "rad" for group, name in alike.items()}
     turned = "orientation" in draft.picks and "tilt" not in titled and largest(draft, "orientation") > 2.1 * np.pi
     verdicts = judge(reaches, {**titled, "tilt": "deg"} if turned else titled)
     for group, verdict in verdicts.items():
@@ -243,11 +252,20 @@ def _angles(draft: Draft, found: dict[str, Unit], *, counted: bool) -> None:
                 _DOUBTFUL_CONFIDENCE,
             )
         for name in (*groups[group], *(["orientation"] if group == "tilt" and "orientation" in draft.picks else [])):
-            found.setdefault(name, Unit(verdict.unit + ("/s" if group in summed else ""), 1.0, why, sure))
+            unit = alike.get(group, verdict.unit)
+            found.setdefault(name, Unit(f"{unit}/s" if group in summed else unit, 1.0, why, sure))
     if "tilt" in verdicts:
         for name in ("pitch_rate", "roll_rate"):
             if name in draft.picks:
-                found.setdefault(name, Unit(f"{verdicts['tilt'].unit}/s", 1.0, "as the angles", 0.9))
+                unit = alike.get("tilt", verdicts["tilt"].unit)
+                found.setdefault(name, Unit(f"{unit}/s", 1.0, "as the angles", 0.9))
+
+
+def _reach(draft: Draft, found: dict[str, Unit], name: str, step: float) -> float:
+    """Return the largest magnitude of a channel: as logged in deg or in an unknown unit, else in rad."""
+    unit = found.get(name)
+    factor = 1.0 if unit is None or unit.name.removesuffix("/s") == "deg" else unit.si
+    return factor * largest(draft, name, step)
 
 
 def _asked_in_another_unit(draft: Draft, found: dict[str, Unit]) -> tuple[str, ...]:
@@ -349,8 +367,8 @@ def _velocities(draft: Draft, found: dict[str, Unit]) -> None:
                 {name: found[references] for name, references in zip(MOTOR_VELOCITIES, SET_POINTS, strict=True)}
             )
         return
-    factors = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0}
-    angle = np.pi / 180.0 if found[MOTOR_POSITIONS[0]][0] == "deg" else 1.0
+    factors = {name: to_si(name)[0] for name in ("rad/s", "deg/s", "rpm")}
+    angle = found[MOTOR_POSITIONS[0]].si
     run = draft.runs()
     periods = [
         angle * velocity_period(draft.values(p), draft.values(v), run)[0]
@@ -370,9 +388,6 @@ def nominal_step(draft: Draft, found: dict[str, Unit]) -> float:
     """Return the time column's median step [s], or the paper's sample time without one."""
     if "time" not in draft.picks:
         return _USUAL_STEP_S
-    unit, factor, *_ = found["time"]
-    if unit == DATE:
-        unit = "s"
     step = np.diff(draft.values("time"))
     typical = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
-    return max(typical * factor * (1e-3 if unit == "ms" else 1.0), 1e-9)
+    return max(typical * (1.0 if found["time"].name == DATE else found["time"].si), 1e-9)

@@ -13,7 +13,7 @@ from ..recording._resampling import Samples
 from ._layout import Column
 
 # A column may fall or stand still in this part of its rows and still be a clock: a rare double stamp.
-_RARE = 0.02
+_RARE, _FEW_STEPS = 0.02, 20
 # Rows of one stamp: at least so many, and each stamp has this part of the usual number at least.
 _MIN_ROWS_OF_STAMP, _EVEN_STAMPS = 3, 0.8
 # Days since 1899-12-30 (spreadsheets, 1982 to 2064) and since year 0 (MATLAB's datenum).
@@ -45,12 +45,14 @@ def find_split_stamp(columns: Mapping[Column, Vector]) -> tuple[Column, Column] 
 
 def find_uneven_clock(columns: Mapping[Column, Vector]) -> Column | None:
     """Return the only column that rises in every row, but for rare double stamps; None if several do."""
-    rising = []
-    for name, values in columns.items():
-        step = np.diff(values)
-        if step.size > 20 and (step >= 0.0).all() and (step > 0.0).mean() > 1.0 - _RARE:
-            rising.append(name)
+    rising = [name for name, values in columns.items() if (np.diff(values) >= 0.0).all() and rises(values)]
     return rising[0] if len(rising) == 1 else None
+
+
+def rises(values: Vector) -> bool:
+    """Return whether a column (time,) rises in all rows but rare ones."""
+    step = np.diff(values)
+    return step.size > _FEW_STEPS and bool((step > 0.0).mean() > 1.0 - _RARE)
 
 
 def rows_of_stamp(values: Vector) -> int | None:

@@ -13,12 +13,13 @@ import numpy as np
 from softneck.core import DataError, SettingsError, SoftneckError, did_you_mean, to_si
 from softneck.robot import Robot
 
-from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, SET_POINTS, parse_column
-from ._column_titles import read_title
-from ._draft import Draft
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, SET_POINTS, parse_column, si_unit
+from ._column_titles import ambiguity
+from ._draft import SURE, Doubt, Draft
 from ._guess_names import by_names
+from ._guess_units import Unit, clock_unit, unread_clocks
 from ._layout import Column, Layout, Source, Term
-from ._roles import NOTHING_NEW, Roles, find_roles, may_be_motor, names_a_place, unit_of
+from ._roles import NOTHING_NEW, Roles, find_roles, may_be_motor, names_a_place
 from ._table_format import SniffResult, sniff
 from .formats._text import DATE
 
@@ -39,15 +40,12 @@ class NamedColumns:
 
 @dataclass(frozen=True, slots=True)
 class RobotGuess:
-    """A robot, whose directions are to be identified, a layout of its log, and the reasons for each column.
-
-    `remark`: for the layout file, where the columns are guessed.
-    """
+    """A robot, whose directions are to be identified, a layout of its log, the reasons for each column, and doubts."""
 
     robot: Robot
     layout: Layout
     lines: tuple[str, ...]
-    remark: str = ""
+    doubts: tuple[Doubt, ...] = ()
 
 
 def is_of_another_robot(path: str | Path) -> bool:
@@ -94,10 +92,6 @@ def guess_robot(
         raise DataError(f"{path}: no column was recognised as {what}. Name them: {columns_line(path, table, roles)}")
     if roles.time is None and sample_time is None:
         raise DataError(f"{path}: no column is a time; say its sample time: --sample-time S.")
-    if roles.time is not None and sample_time is not None:
-        raise SettingsError(
-            f"{path}: has a clock, `{roles.time}`; leave out --sample-time, or say --resample {sample_time:g}."
-        )
     whole = bool(given["motors"] and given["outputs"])
     if robot is None:
         neck = whole and _of_neck(table, roles)
@@ -108,16 +102,28 @@ def guess_robot(
         *zip(robot.outputs.names, roles.outputs, strict=True),
     ]
     channels += zip(robot.motor_positions, roles.positions, strict=False)  # of no motor or of all
-    layout = replace(_layout(table, robot, channels, roles), sample_time=sample_time)
+    layout, clock = _layout(path, table, robot, channels, roles, sample_time)
     taken = [f"motors: {_list(roles.motors)}{f': {roles.why}' if roles.why else ''}"]
     taken += [f"measured positions: {_list(roles.positions)}"] if roles.positions else []
     taken += [f"outputs: {_list(roles.outputs)}"]
-    unknown = [(column, unit_of(table, column)) for column in (*roles.motors, *roles.outputs)]
-    doubts = [f"{column}: unit `{text}` is unknown here and taken as 1" for column, (unit, text) in unknown
-              if text and unit is None]  # fmt: skip
-    remark = f"NOT SURE: robot: {_list(roles.motors)} move, {_list(roles.outputs)} are outputs (80 % sure): by titles"
-    lines = (*table.lines, *taken, *doubts, *roles.lines)
-    return RobotGuess(robot, layout, lines, "" if whole else remark)
+    doubts = [*_unit_doubts(table, channels), *clock]
+    if not whole:
+        why = f"{_list(roles.motors)} move, {_list(roles.outputs)} are outputs"
+        doubts.insert(0, Doubt("robot", robot.set_points[:1], why, 0.8, "by titles"))
+    said = [f"not sure: {doubt}" for doubt in doubts[not whole :]]
+    return RobotGuess(robot, layout, (*table.lines, *taken, *said, *roles.lines), tuple(doubts))
+
+
+def _unit_doubts(table: SniffResult, channels: Sequence[tuple[str, Column]]) -> list[Doubt]:
+    """Return a doubt for each unit of the titles that is unknown or ambiguous, with the channels that have it."""
+    found: dict[str, Doubt] = {}
+    for name, column in channels:
+        title = table.title(column)
+        why = ambiguity(title, table.columns) if title.unit else "it is unknown here"
+        if title.written and why:
+            before = found.get(title.written, Doubt(f"unit `{title.written}`", (), title.unit or "1", 0.6, why))
+            found[title.written] = replace(before, channels=(*before.channels, name))
+    return list(found.values())
 
 
 def columns_line(path: str | Path, table: SniffResult | None = None, roles: Roles | None = None) -> str:
@@ -209,8 +215,8 @@ def _require_counts(path: str | Path, robot: Robot, roles: Roles) -> None:
 
 def _of_neck(table: SniffResult, roles: Roles) -> bool:
     """Return whether columns are three winches in angles, pitch and roll."""
-    units = [unit_of(table, column)[0] or "rad" for column in roles.motors]
-    titled = [read_title(str(column)).role for column in roles.outputs]
+    units = [table.title(column).unit or "rad" for column in roles.motors]
+    titled = [table.title(column).role for column in roles.outputs]
     return len(units) == 3 and titled == ["pitch", "roll"] and all(to_si(unit)[1] == "rad" for unit in units)
 
 
@@ -227,8 +233,8 @@ def _propose_robot(path: str | Path, table: SniffResult, roles: Roles) -> Robot:
         raise DataError(f"{path}: {str(error).removesuffix('.')}. Name fewer: --motor COL, --output COL.") from error
 
 
-def layout_for(path: str | Path, robot: Robot, *, sample_time: float | None = None) -> Layout:
-    """Return the layout of a log titled by the robot's channels, or by the names of its motors and outputs.
+def layout_for(path: str | Path, robot: Robot, *, sample_time: float | None = None) -> RobotGuess:
+    """Return the layout of a log titled by the channels of its robot, or by the names of its motors and outputs.
 
     `sample_time`: of a log without a clock [s].
     """
@@ -254,8 +260,10 @@ def layout_for(path: str | Path, robot: Robot, *, sample_time: float | None = No
         for j, (channel, name) in enumerate(zip(robot.set_points, robot.motors.names, strict=True), start=1)
     ]
     channels += [(name, title_of(name)) for name in robot.outputs.names]
-    layout = _layout(table, robot, [*channels, *_own_channels(rest, robot, dict(channels))], roles)
-    return layout if sample_time is None else replace(layout, sample_time=sample_time)
+    channels += _own_channels(rest, robot, dict(channels))
+    layout, clock = _layout(path, table, robot, channels, roles, sample_time)
+    doubts = (*_unit_doubts(table, channels), *clock)
+    return RobotGuess(robot, layout, tuple(f"not sure: {doubt}" for doubt in doubts), doubts)
 
 
 def _own_channels(titles: Sequence[str], robot: Robot, taken: dict[str, str]) -> list[tuple[str, str]]:
@@ -271,33 +279,40 @@ def _own_channels(titles: Sequence[str], robot: Robot, taken: dict[str, str]) ->
     return list(found.items())
 
 
-def _layout(table: SniffResult, robot: Robot, channels: Sequence[tuple[str, Column]], roles: Roles) -> Layout:
+def _layout(
+    path: str | Path, table: SniffResult, robot: Robot, channels: Sequence[tuple[str, Column]], roles: Roles,
+    sample_time: float | None,
+) -> tuple[Layout, list[Doubt]]:  # fmt: skip
+    """Return the layout of a log, and what is doubted of its clock; `sample_time` is of one without [s]."""
+    if roles.time is not None and sample_time is not None:
+        raise SettingsError(
+            f"{path}: has a clock, `{roles.time}`; leave out --sample-time, or say --resample {sample_time:g}."
+        )
     default = dict.fromkeys(robot.outputs.names, robot.outputs.display_unit)
-    time = None
+    sources = {name: Source((Term(title),), table.title(title).unit or default.get(name, robot.motors.unit))
+               for name, title in channels}  # fmt: skip
+    for name, title in channels:
+        if to_si(sources[name].unit)[1] != si_unit(name, robot):
+            raise DataError(f"{path}: `{title}` is in {sources[name].unit}; `{name}` of robot {robot.label()} is not.")
+    time, doubts = None, []
     if roles.time is not None:
-        clock = DATE if roles.time in table.dates else read_title(str(roles.time)).unit or "s"
-        time = Source((Term(roles.time),), clock)
-
-    def unit(name: str, title: Column) -> str:
-        bracket = _UNIT.search(str(title))
-        known = unit_of(table, title)[0]
-        if known is None and bracket is not None and name not in default and bracket[1].endswith("/s"):
-            known = bracket[1]
-        return known or default.get(name, robot.motors.unit)
-
-    return replace(
-        table.form,
-        channels={name: Source((Term(title),), unit(name, title)) for name, title in channels},
-        time=time,
-        sample_time=robot.sample_time_s if time is None else None,
-        run=roles.run,
-        robot=robot,
-    )
+        named, dates = table.title(roles.time), roles.time in table.dates
+        titled = named.unit if named.quantity == "s" else None
+        unit = Unit(DATE, 1.0, "") if dates else clock_unit(table.columns[roles.time], titled)
+        time = Source((Term(roles.time, unit.factor),), unit.name)
+        doubts = [Doubt("clock", ("time",), unit.name, unit.confidence, unit.why)] if unit.confidence < SURE else []
+    elif sample_time is not None:
+        doubts = unread_clocks(table, sample_time)
+    layout = replace(
+        table.form, channels=sources, time=time, run=roles.run, robot=robot,
+        sample_time=(sample_time or robot.sample_time_s) if time is None else None,
+    )  # fmt: skip
+    return layout, doubts
 
 
 def _common_unit(path: str | Path, table: SniffResult, titles: Sequence[Column]) -> str:
     """Return the common unit in the titles; 1 without any."""
-    units = [unit_of(table, title)[0] or "1" for title in titles]
+    units = [table.title(title).unit or "1" for title in titles]
     if len({to_si(unit)[1] for unit in units}) > 1:
         raise DataError(
             f"{path}: {_list(titles)} are in {', '.join(units)}, and a robot has one unit for all of them; name those "

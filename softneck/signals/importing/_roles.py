@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Vector, to_si
+from softneck.core import Matrix, Vector
 
-from ._column_titles import plain, read_title, words_of
+from ._column_titles import TEMPERATURES, plain, read_title, words_of
 from ._guess_shapes import correlation
 from ._layout import Column
 from ._table_format import SniffResult
@@ -55,11 +55,6 @@ _PLACE = {"position", "pos", "angle"}
 # Words of which glued titles such as `Pcmd` and `Solldruck` consist, besides one leading letter.
 _KNOWN = _COMMAND | _MEASURED | _SENT | _ACTUATOR | _LOAD | _OUTPUT | _RATE | _ASIDE | _PLACE | {"p"}
 _GLUED = sorted((word for word in _KNOWN | set(_TRANSLATED) if len(word) > 1), key=len, reverse=True)
-_TEMPERATURES = {"c", "degc", "°c", "degf", "°f", "f", "k"}
-#: Units of robots by their spelling in lower case, where that is one unit only.
-_SPELLED = {"pct": "%", "percent": "%", "prozent": "%", "kpa": "kPa", "hpa": "hPa", "volts": "V", "volt": "V",
-            "amps": "A", "amp": "A", "nm": "N m", "mnm": "mN m", "micros": "us", "µs": "us",
-            "graus": "deg", "gradi": "deg", "degres": "deg"}  # fmt: skip
 # A measured motor follows its set-point at least so closely; a copy is equal but for the last digit.
 _FOLLOWS, _DIGITS, _EQUAL = 0.5, 1e-9, 1e-3
 _RATE_AGREES, _FEW_ROWS = 0.98, 20
@@ -143,20 +138,6 @@ class _Words:
         return self.quantity or next((word for word in ("pwm", "pressure", "voltage") if word in self.words), "1")
 
 
-def unit_of(table: SniffResult, column: Column) -> tuple[str | None, str]:
-    """Return the unit in which softneck reads a column (None: unknown or none), and how the log writes it."""
-    title = read_title(str(column))
-    written = title.other or title.unit or table.units.get(column, "")
-    spelled = _SPELLED.get(plain(written), written)
-    for unit in (title.unit or spelled, spelled, spelled.lower()):
-        try:
-            to_si(unit)
-        except DataError:
-            continue
-        return unit, written
-    return None, written
-
-
 def find_roles(table: SniffResult, named: Mapping[str, Sequence[Column]]) -> Roles:
     """Return the roles of a log's columns; `named` holds the motors, positions and outputs that the user named."""
     found = Roles()
@@ -188,11 +169,10 @@ def find_roles(table: SniffResult, named: Mapping[str, Sequence[Column]]) -> Rol
 def _read(table: SniffResult, column: Column) -> _Words:
     if isinstance(column, int):
         return _Words(frozenset(), None, None, None)
-    unit, written = unit_of(table, column)
-    title = read_title(column)
+    title = table.title(column)
     words = {part for word in title.family.split() for part in _split(word)}
-    words |= {"temp"} if written.lower() in _TEMPERATURES or plain(written).lower() in _TEMPERATURES else set()
-    return _Words(frozenset(words), title.motor, unit, None if unit in (None, "1") else to_si(unit)[1])
+    words |= {"temp"} if plain(title.written) in TEMPERATURES else set()
+    return _Words(frozenset(words), title.motor, title.unit, None if title.unit == "1" else title.quantity or None)
 
 
 def _split(word: str) -> list[str]:
@@ -229,8 +209,8 @@ def _clock(table: SniffResult, columns: Iterable[Column]) -> Column | None:
         step = np.diff(values)
         if step.size < 2 or not np.isfinite(step).all():
             continue
-        title = read_title(str(column))
-        named = title.role == "time" or column in table.dates or unit_of(table, column)[1] in ("s", "ms", "us", "ns")
+        title = table.title(column)
+        named = title.role == "time" or column in table.dates or title.written in ("s", "ms", "us", "ns")
         rising = float((step > 0).mean())
         if (named and rising > 0.5) or (isinstance(column, int) and (step > 0).all()):
             found.append((rising, column))

@@ -16,6 +16,7 @@ from softneck.core import DataError, FileFormatError, Vector
 
 from ..recording._files import WHITESPACE, read_table
 from ._clocks import last_values
+from ._column_titles import Title, read_title
 from ._layout import Column, Layout
 from .formats._mat import mat_arrays, table_of
 from .formats._mcap import mcap_table
@@ -63,6 +64,11 @@ class SniffResult:
     dates: frozenset[Column]
     frame: pd.DataFrame
     doubt: str = ""
+
+    def title(self, column: Column) -> Title:
+        """Return the meaning of a column's title, with the unit of a line of units."""
+        unit = self.units.get(column)
+        return read_title(str(column) if unit is None else f"{column} [{unit}]")
 
     def lacks(self, column: Column) -> bool:
         """Return whether a column has empty cells."""
