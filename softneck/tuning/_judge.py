@@ -40,8 +40,8 @@ from softneck.verification import (
     step_time,
 )
 
-from ._requirements import TuneRequirements, can_follow_circle
-from ._task import MARGINS, Judgement, Task, circle_angles, curve_times, has_observer
+from ._requirements import TuneRequirements, can_follow_circle, default_payloads
+from ._task import Judgement, Task, circle_angles, curve_times, has_observer
 
 # Time to reach the circle [s], and turns, of which the last is judged.
 _LEAD_IN_S, _TURN_COUNT = 2.0, 2.0
@@ -150,6 +150,12 @@ def told_conditions(task: Task, own: Sequence[SimulationModel], sample_time: flo
     """Return condition -> what is judged instead of it, for each that was asked and is not judged as it is."""
     found, late = judged_elsewhere(own, task.asked.certificate), task.asked.track["delay_ms"]
     judged = 1e3 * judged_delay(late, sample_time)
+    heavy = [kg for kg in default_payloads() if kg > max(task.asked.certificate.sim["payloads_kg"])]
+    if task.drawn and heavy and task.robot.neck is not None and "sim.payloads_kg" not in task.asked.stated:
+        found[f"payload {max(heavy):g} kg"] = (
+            f"judged with at most {max(task.asked.certificate.sim['payloads_kg']):g} kg, as recorded; for more record "
+            f"`softneck record mixed --payload {max(heavy):g}` and give both recordings"
+        )
     if own and late > 0.0 and not math.isclose(judged, late, rel_tol=1e-6):
         found[f"additional delay {late:g} ms"] = f"judged at {judged:g} ms, whole samples of the loop"
     return found
@@ -300,7 +306,7 @@ def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float
             keep_worse(found, name, value)
             if last in (*LARGE, *SMALL) and axis != "mimo":
                 keep_worse(found, f"axes.{last}", value)
-        # Where draws decide, margins are found on them.
+        # Where draws decide, the weight over all amplitudes at once does not; the box alone leads the search.
         for item in () if task.drawn else data_margins(task.linear, law, plants.axes, judged_one.extra, steep):
             # A loop that may cross outside the recorded band has no certified margin.
             values = item.margins or {**dict.fromkeys(LARGE, 0.0), "sensitivity": math.inf}
@@ -308,8 +314,6 @@ def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float
                 for group in (item.axis, "axes", *(("mimo",) if last == "disk_margin" else ())):
                     keep_worse(found, f"{group}.{last}", float(value))
             keep_worse(found, "robust.mu", item.mu)
-    for name in MARGINS if task.drawn else ():
-        found.pop(name, None)
     steps = run_steps(
         plants, judged_one.block, asked.step_test(task.seed), workers=1, robot=task.robot, weights=ready.weights
     )

@@ -51,8 +51,8 @@ class TuneRequirements:
 
     `certificate`: requirements of `verify`. `track`: settings of the additional loops. `bounds`: all requirements,
     those of `certificate` first, less the safety margins. `reserve`: metric -> safety margin of its limit, for the
-    difference between a robot and its models. `stated`: metrics and keys of [track] that the user states. `table`: a
-    requirements file that gives `tune` and `verify` the same requirements.
+    difference between a robot and its models. `stated`: metrics and keys of [track] and [sim] that the user states.
+    `table`: a requirements file that gives `tune` and `verify` the same requirements.
     """
 
     certificate: Requirements
@@ -90,20 +90,22 @@ class TuneRequirements:
 
 def read_tune_requirements(
     path: str | Path | None = None, *, robot: Robot | None = None, scale: Scale | None = None, stepping: bool = True,
-    rise: float | None = None,
+    rise: float | None = None, payload: float | None = None,
 ) -> TuneRequirements:  # fmt: skip
     """Return the requirements of a file, with defaults for the rest.
 
     `path`: a requirements file, also one for `verify`. `robot`: of the controller; None: the neck. `scale`: of the
     defaults; None: from the robot alone. `stepping`: whether there are simulation models; else default `sim.*` limits
     apply to the linear plants. `rise`: the default [s]; None: that of the paper's neck, by the robot's time constant.
+    `payload`: the heaviest recorded one [kg], to which defaults go; None: not known.
     """
-    return read_file(path, partial(make_tune_requirements, robot=robot, scale=scale, stepping=stepping, rise=rise))
+    make = partial(make_tune_requirements, robot=robot, scale=scale, stepping=stepping, rise=rise, payload=payload)
+    return read_file(path, make)
 
 
 def make_tune_requirements(
     table: Mapping[str, Any], *, robot: Robot | None = None, scale: Scale | None = None, stepping: bool = True,
-    rise: float | None = None,
+    rise: float | None = None, payload: float | None = None,
 ) -> TuneRequirements:  # fmt: skip
     """Return the requirements of a table like a requirements file, with defaults for the rest."""
     scale = scale or Scale.of(robot or Robot.preset())
@@ -115,6 +117,9 @@ def make_tune_requirements(
         usual["require"] = {name: limit for name, limit in usual["require"].items() if not name.startswith("track.")}
     if rise is not None:
         usual["require"][_RISE_METRIC] = {"max": rise}
+    if payload is not None:
+        heavy = usual["sim"]["payloads_kg"]
+        usual["sim"] = {**usual["sim"], "payloads_kg": sorted({min(kg, payload) for kg in heavy})}
     if not stepping:
         usual = _for_linear(usual)
     merged = {
@@ -133,7 +138,7 @@ def make_tune_requirements(
         certificate=certificate, track=track, bounds=(*certificate.bounds, *extra), reserve=reserve,
         table={"version": VERSION, **merged},
         stated=frozenset(metric for metric, entry in table.get("require", {}).items() if entry is not False)
-        | frozenset(f"track.{key}" for key in table.get("track", {})),
+        | frozenset(f"{name}.{key}" for name in ("track", "sim") for key in table.get(name, {})),
     )  # fmt: skip
 
 
@@ -141,6 +146,11 @@ def default_text() -> str:
     """Return the defaults of tuning as a requirements file, with the rise of the paper's neck."""
     limits = default_limits.TUNE | {_RISE_METRIC: default_limits.NECK_RISE_S}
     return DEFAULT_FILE.read_text(encoding="utf-8") + default_limits.as_toml(limits)
+
+
+def default_payloads() -> list[float]:
+    """Return the payloads [kg] of loops, where the recordings have them."""
+    return tomllib.loads(DEFAULT_FILE.read_text(encoding="utf-8"))["sim"]["payloads_kg"]
 
 
 def can_follow_circle(robot: Robot) -> bool:

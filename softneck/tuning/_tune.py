@@ -231,7 +231,9 @@ def _read_requirements(requirements: Any, robot: Robot, linear: list[Any], *, st
         return requirements
     scale = Scale.of(robot, sources_of({str(k): thing for k, thing in enumerate(linear)}))
     make = make_tune_requirements if isinstance(requirements, Mapping) else read_tune_requirements
-    read = partial(make, requirements, scale=scale, stepping=stepping)
+    drawn = [thing.draws for thing in linear if getattr(thing, "draws", None) is not None]
+    heaviest = min((max(draws.conditions["payload_kg"]) for draws in drawn), default=None)
+    read = partial(make, requirements, scale=scale, stepping=stepping, payload=heaviest)
     return read(rise=default_rise(linear, read()))
 
 

@@ -14,7 +14,16 @@ from softneck.core import metric_of
 from softneck.loop import LoopResult
 from softneck.robot import Robot
 from softneck.tuning import _judge
-from softneck.tuning._judge import Case, keep_worse, linear_metrics, loop_metrics, margin_metrics, run_case, variation
+from softneck.tuning._judge import (
+    Case,
+    keep_worse,
+    linear_metrics,
+    loop_metrics,
+    margin_metrics,
+    run_case,
+    told_conditions,
+    variation,
+)
 from softneck.tuning._search import Candidate, ratio
 from softneck.tuning._task import Judgement
 from softneck.tuning._tune import front
@@ -295,3 +304,17 @@ def test_the_front_keeps_what_none_beats_margins_upwards() -> None:
     assert [item.metrics["sim.rise_s"] for item in found] == [0.5, 1.0, 2.0]
     assert found[-1].metrics["axes.gain_margin"] == 3.0
     assert is_worse("axes.gain_margin", 2.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("drawn", "stated", "heaviest", "told"), [(("d",), (), 0.0, True), (("d",), ("sim.payloads_kg",), 0.0, False),
+                                              (("d",), (), 1.0, False), ((), (), 0.0, False)]
+)  # fmt: skip
+def test_a_default_payload_that_was_not_recorded_is_told(
+    drawn: tuple[str, ...], stated: tuple[str, ...], heaviest: float, told: bool
+) -> None:
+    task = _task(sim={"payloads_kg": [heaviest]}, own={}, robot=Robot.preset())
+    task.drawn, task.asked.track, task.asked.stated = drawn, {"delay_ms": 0.0}, frozenset(stated)
+    found = told_conditions(task, [], TS)
+    assert list(found) == ["payload 1 kg"] * told
+    assert all(text.startswith("judged with at most 0 kg") and "--payload 1`" in text for text in found.values())

@@ -230,3 +230,18 @@ def test_a_load_rejected_within_the_dead_time_is_refused() -> None:
     asked = make_tune_requirements({"require": {"step.load_rms_deg": {"max": 0.02}}})
     with pytest.raises(SettingsError, match="dead time before any feedback acts"):
         check_feasibility(asked, neck())
+
+
+@pytest.mark.parametrize(
+    ("payload", "judged"), [(None, [0.32, 1.0]), (0.0, [0.0]), (0.5, [0.32, 0.5]), (2.0, [0.32, 1.0])]
+)
+def test_default_payloads_go_to_the_heaviest_recorded_one_and_stated_ones_stay(
+    payload: float | None, judged: list[float]
+) -> None:
+    asked = make_tune_requirements({}, payload=payload)
+    assert asked.certificate.sim["payloads_kg"] == judged
+    # The file that `tune` writes asks `verify` for the same.
+    assert make_tune_requirements(asked.table, payload=0.0).certificate.sim["payloads_kg"] == judged
+    stated = make_tune_requirements({"sim": {"payloads_kg": [0.7]}}, payload=payload)
+    assert stated.certificate.sim["payloads_kg"] == [0.7]
+    assert ("sim.payloads_kg" in stated.stated, "sim.payloads_kg" in asked.stated) == (True, False)

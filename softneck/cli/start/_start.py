@@ -43,6 +43,10 @@ _LINE = 160 - len("softneck: ")
 _OWN_REQUIREMENTS = (
     "for requirements of your own see `softneck tune --print-requirements`, and pass them by --requirements"
 )
+_SECOND_VISIT = (
+    "to accept that: --requirements {folder}/tune/requirements.toml; to have more: record another motion (`softneck "
+    "record mixed`, `softneck drives record mixed`) and start with both logs, as more motions leave fewer models"
+)
 _WITHOUT = re.compile(r"Leave .* out of `outputs\.names` in a robot\.toml")
 # Sentences end where the next begins with a capital; `0.5 %.` within one does not.
 _FIRST_SENTENCE = re.compile(r"(?:[^:]*\.(?:csv|npz): )?((?s:.*?)[^.\s]\.)(?=\s+[`A-Z]|$)")
@@ -242,18 +246,24 @@ def _facts(run: ProjectRun, folder: Path) -> dict[str, Any]:
         "failed": [row["stage"] for row in rows if not row["holds"]],
         "models": {sort: _model(file) for sort, file in models.items() if file is not None},
         "controller": BEST,
-        "loosened": _read_loosened(),
+        **_certified(),
         "report": "build/report.html",
         "steps": rows,
     }
 
 
-def _read_loosened() -> dict[str, dict[str, float]]:
-    """Return metric -> the loosened default of the tuned controller, and the value reached."""
+def _certified() -> dict[str, Any]:
+    """Return what the certificate of the tuned controller says beside its requirements.
+
+    "loosened": metric -> the loosened default, and the value reached. "draws": what loops over them say, in words.
+    "judged_elsewhere": condition -> what was judged instead of it.
+    """
     certificate = Path(_CERTIFICATE_FILE)
-    if not certificate.is_file():
-        return {}
-    return json.loads(settings_text(certificate, MOST_JSON)).get("loosened", {})
+    said = json.loads(settings_text(certificate, MOST_JSON)) if certificate.is_file() else {}
+    return {
+        "loosened": said.get("loosened", {}), "draws": [part["statement"] for part in said.get("draws", [])],
+        "judged_elsewhere": said.get("judged_elsewhere", {}),
+    }  # fmt: skip
 
 
 def _doubts() -> dict[str, list[str]]:
@@ -295,6 +305,10 @@ def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
         print_table(f"Verdict on {folder}", ["step", "", "processor time [s]"], _rows(facts))
         for metric, one in facts["loosened"].items():
             click.echo(f"all holds but {Loosened(**one).in_words(metric)}")
+        if facts["loosened"]:
+            click.echo(_SECOND_VISIT.format(folder=folder))
+        for line in (*facts["draws"], *(f"{what}: {how}" for what, how in facts["judged_elsewhere"].items())):
+            click.echo(line)
         for doubt in (one for found in facts["doubts"].values() for one in found):
             click.echo(f"not sure: {doubt}")
         click.echo(f"report: {folder}/{facts['report']}")

@@ -11,7 +11,7 @@ import pytest
 from softneck.cli.start import _start
 from softneck.cli.start._plan import Options, Step, Unmet
 from softneck.cli.start._project_run import ProjectRun
-from softneck.cli.start._start import _doubts
+from softneck.cli.start._start import _certified, _doubts
 
 
 def short_plan(asked: Options) -> Iterator[Step]:
@@ -28,7 +28,7 @@ def facts_of(run: ProjectRun, folder: Path) -> dict[str, Any]:
     """What a run that ends before its models says of itself."""
     rows = [{"stage": key.partition(":")[0], "done_before": kept, **run.done[key]}
             for key, kept in run.ran.items()]  # fmt: skip
-    more = {"models": {}, "report": "none", "doubts": _doubts(), "loosened": {}, "failed": [], "steps": rows}
+    more = {"models": {}, "report": "none", "doubts": _doubts(), **_certified(), "failed": [], "steps": rows}
     return {"folder": str(folder), **more}
 
 

@@ -90,6 +90,8 @@ def test_what_was_left_out_fails_in_the_verdict_whatever_came_of_the_rest(
             "folder": str(folder),
             "models": {},
             "loosened": {},
+            "draws": [],
+            "judged_elsewhere": {},
             "report": "",
             "doubts": {},
             "failed": ["tune"],
@@ -223,3 +225,31 @@ def test_named_columns_are_given_to_the_import(tmp_path: Path, monkeypatch: pyte
         step.depends_on
         != _plan._import(str(log), "recordings/log.csv", Options(logs=(str(log),), motors=("y",))).depends_on
     )
+
+
+def test_the_verdict_says_what_holds_what_does_not_and_what_to_record(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert _start._certified() == {"loosened": {}, "draws": [], "judged_elsewhere": {}}
+    said = {
+        "loosened": {"sim.rise_s": {"default": 0.53, "reached": 0.62, "limit": 0.66}},
+        "draws": [{"statement": "none of 59 draws of family fails"}],
+        "judged_elsewhere": {"payload 1 kg": "judged with at most 0 kg, as recorded"},
+    }
+    path = tmp_path / "tune/best.certificate.json"
+    path.parent.mkdir()
+    path.write_text(json.dumps(said), encoding="utf-8")
+    row = {"stage": "tune", "holds": True, "seconds": 1.0, "said": "", "done_before": False}
+    _start._tell(
+        {"folder": "my_neck", "models": {}, **_start._certified(), "doubts": {}, "failed": [], "steps": [row],
+         "not_run": {}, "report": "r.html"}, as_json=False,
+    )  # fmt: skip
+    lines = capsys.readouterr().out.splitlines()
+    at = lines.index("all holds but sim.rise_s: 0.62, by default 0.53 is required (certified: 0.66)")
+    assert lines[at + 1].startswith(
+        "to accept that: --requirements my_neck/tune/requirements.toml; to have more: record"
+    )
+    assert lines[at + 2 : at + 4] == [
+        "none of 59 draws of family fails", "payload 1 kg: judged with at most 0 kg, as recorded"
+    ]  # fmt: skip
