@@ -23,7 +23,7 @@ SETTINGS = PidSettings(max_sensitivity=1.6, noise_gain=5.0)
 
 
 def case(loops: Any, settings: PidSettings = SETTINGS, *, static_gain: float = 0.1) -> _WorstCase:
-    return _WorstCase(settings, None, Z, np.asarray(loops, complex), DT, static_gain, 1.0)  # pyright: ignore[reportArgumentType]
+    return _WorstCase(settings, (), None, Z, np.asarray(loops, complex), DT, static_gain, 1.0)  # pyright: ignore[reportArgumentType]
 
 
 def with_sensitivity(*sizes: float) -> np.ndarray:
@@ -61,8 +61,9 @@ def test_the_noise_is_bound_as_well_and_both_excesses_add_up() -> None:
 
 
 def test_gains_are_scaled_back_until_all_bounds_hold(monkeypatch: pytest.MonkeyPatch) -> None:
-    def scaled(*, excess: Any, load: float = 1.0) -> PidGains | None:
+    def scaled(*, excess: Any, load: float = 1.0, peak: Any = lambda _: 1.6) -> PidGains | None:
         monkeypatch.setattr(_WorstCase, "excess", lambda _, gains: excess(gains.gain))
+        monkeypatch.setattr(_WorstCase, "_peak", lambda _, gains: peak(gains.gain))
         monkeypatch.setattr(_WorstCase, "load", lambda *_: load)
         return case(with_sensitivity(1.2)).scale_to_bounds(GAINS)
 
@@ -70,9 +71,11 @@ def test_gains_are_scaled_back_until_all_bounds_hold(monkeypatch: pytest.MonkeyP
     found = scaled(excess=lambda gain: max(gain - 1.9, 0.0))
     assert found is not None
     assert 0.995 * 1.9 < found.gain <= 1.9
+    assert found == scaled(excess=lambda _: 0.0, peak=lambda gain: 1.6 if gain <= 1.9 else 1.61)
     assert replace(found, gain=GAINS.gain) == GAINS
     for unknown in (lambda _: math.nan, lambda _: 1e-9, lambda _: math.inf):
         assert scaled(excess=unknown) is None
+        assert scaled(excess=lambda _: 0.0, peak=lambda gain, unknown=unknown: 1.6 + unknown(gain)) is None
     for load in (1e3, math.nan, 1e6):
         assert scaled(excess=lambda _: 0.0, load=load) is None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -10,9 +11,10 @@ from typing import ClassVar
 import numpy as np
 
 from softneck.core import SettingsError, Vector, require_between
+from softneck.estimation import AxisPlant
 
 from ..plants._uncertain import UncertainAxis
-from ._axis_loop import Sweep, coarse_frequencies, conditioning_gain
+from ._axis_loop import Sweep, coarse_frequencies, conditioning_gain, sensitivities
 from ._controller import AxisController
 from ._settings import AxisDesign, AxisSettings
 
@@ -123,6 +125,7 @@ class _WorstCase:
     """Cost and bounds of gains on the worst sample."""
 
     settings: PidSettings
+    samples: Sequence[AxisPlant]
     sweep: Sweep
     z: np.ndarray
     loops: np.ndarray
@@ -135,8 +138,8 @@ class _WorstCase:
         dt = axis.sample_time
         w = coarse_frequencies(axis.nominal)
         loops = np.array([plant.response(w, extra_delay=settings.extra_delay) for plant in axis.samples])
-        return cls(settings, settings._sweep(axis), np.exp(1j * w * dt), loops, dt, axis.nominal.static_gain,
-                   axis.nominal.second)  # fmt: skip
+        return cls(settings, axis.samples, settings._sweep(axis), np.exp(1j * w * dt), loops, dt,
+                   axis.nominal.static_gain, axis.nominal.second)  # fmt: skip
 
     def select_hardest(self, gains: PidGains) -> _WorstCase:
         """Return the judge of the samples on which a load is worst under `gains`: the others do not decide."""
@@ -163,10 +166,15 @@ class _WorstCase:
         bounds = self.settings
         return max(sensitivity / bounds.max_sensitivity - 1.0, 0.0) + max(noise / bounds.noise_gain - 1.0, 0.0)
 
+    def _peak(self, gains: PidGains) -> float:
+        """Return the largest sensitivity over the samples, between the frequencies of the search too."""
+        return float(sensitivities(gains.axis(self.sample_time), self.samples, self.settings.extra_delay).max())
+
     def scale_to_bounds(self, gains: PidGains) -> PidGains | None:
         """Return the gains, scaled back until all bounds hold and all samples are stable; None if none are."""
+        most = self.settings.max_sensitivity
         for _ in range(_MAX_SCALING_STEPS):
-            if self.excess(gains) == 0.0 and self.load(gains) < 1e3:
+            if self.excess(gains) == 0.0 and self.load(gains) < 1e3 and self._peak(gains) <= most:
                 return gains
             gains = replace(gains, gain=0.995 * gains.gain)
         return None

@@ -9,8 +9,8 @@ from softneck.core import Vector
 # The range of one turn is overrun by rounding and noise of the last digit only.
 _RANGE_TOLERANCE = 1e-3
 # [turns] A jump is longer than half a turn; without it, the step is an ordinary one: at most this long, or a few times
-# as long as nearly all other steps.
-_JUMP, _STEP, _LONG_STEP_RATIO = 0.5, 0.1, 3.0
+# as long as nearly all other steps and at most the last: of longer ones nobody can say which way they went.
+_JUMP, _STEP, _LONG_STEP_RATIO, _LONGEST_STEP = 0.5, 0.1, 3.0, 0.25
 # Smallest share of rows that move: a command held between steps may go from 0 to a full turn.
 _MIN_MOVING = 0.3
 
@@ -28,7 +28,9 @@ def count_wraps(x: Vector, turn: float) -> int:
         return 0
     rest = np.abs(step[jumps] - turn * np.sign(step[jumps]))
     usual = float(np.quantile(np.abs(step[~jumps]), 0.99)) if (~jumps).any() else 0.0
-    return int(jumps.sum()) if rest.max() <= max(_STEP * turn, _LONG_STEP_RATIO * usual) else 0
+    return (
+        int(jumps.sum()) if rest.max() <= max(_STEP * turn, min(_LONG_STEP_RATIO * usual, _LONGEST_STEP * turn)) else 0
+    )
 
 
 def unwrap(x: Vector, run: np.ndarray, turn: float) -> tuple[Vector, int]:
