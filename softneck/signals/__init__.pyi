@@ -30,7 +30,7 @@ from .recording._resampling import resampled as resampled
 from ._excitation import Changes as Changes
 from .importing._clocks import pitch_roll as pitch_roll
 from .importing._draft import Doubt as Doubt
-from .importing._guess import ONE_AXIS as ONE_AXIS
+from .importing._layout import ONE_AXIS as ONE_AXIS
 from .importing._layout import Source as Source
 from .importing._layout import doubts_in as doubts_in
 from .importing._log import ImportResult as ImportResult

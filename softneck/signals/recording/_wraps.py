@@ -11,6 +11,8 @@ _RANGE_TOLERANCE = 1e-3
 # [turns] A jump is longer than half a turn; without it, the step is an ordinary one: at most this long, or a few times
 # as long as nearly all other steps and at most the last: of longer ones nobody can say which way they went.
 _JUMP, _STEP, _LONG_STEP_RATIO, _LONGEST_STEP = 0.5, 0.1, 3.0, 0.25
+# So few samples do not tell an ordinary step.
+_LEAST_SAMPLES = 50
 # Smallest share of rows that move: a command held between steps may go from 0 to a full turn.
 _MIN_MOVING = 0.3
 
@@ -18,6 +20,8 @@ _MIN_MOVING = 0.3
 def count_wraps(x: Vector, turn: float) -> int:
     """Return how often an angle (time,) of one run wraps within [0, turn] or [-turn/2, turn/2]; 0 for other jumps."""
     x = x[np.isfinite(x)]
+    if x.size < _LEAST_SAMPLES:
+        return 0
     step = np.diff(x)
     jumps = np.abs(step) > _JUMP * turn
     if not jumps.any() or jumps.mean() > _MIN_MOVING or np.mean(step != 0) < _MIN_MOVING:
