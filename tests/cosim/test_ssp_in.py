@@ -229,7 +229,7 @@ MASTER = f'''<ssd:Annotations><ssc:Annotation type="softneck">
 
 def test_an_archive_of_another_writer(foreign: Path, tmp_path: Path) -> None:
     more = {"resources/": b"", "resources/values.ssv": VALUES.encode(), "resources/map.ssm": MAPPING.encode()}
-    with pytest.raises(SettingsError, match="has a step size; put `<ssd:Annotations>"):
+    with pytest.raises(SettingsError, match="has a step size; give one in s, for instance `--step"):
         load_ssp(archive(tmp_path, foreign, THEIRS.format(""), more))
     result = simulate(load_ssp(archive(tmp_path, foreign, THEIRS.format(MASTER), more)))
     alpha, beta = 0.0, 0.0
