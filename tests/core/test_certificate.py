@@ -114,3 +114,28 @@ def test_the_certificate_is_looked_for_beside_the_controller(tmp_path: Path) -> 
     path, controller = _written(tmp_path)
     assert certificate_path(controller) == path
     assert json.loads(path.read_text(encoding="utf-8"))["softneck"]
+
+
+def test_a_certificate_without_requirements_and_a_row_without_a_verdict_certify_nothing(tmp_path: Path) -> None:
+    path, controller = tmp_path / "none.json", tmp_path / "pi.npz"
+    controller.write_bytes(b"a controller")
+    files = {"controller": (str(controller), file_hash(controller))}
+    write_certificate(path, certificate_contents("verify", holds=True, files=files, more={"requirements": []}))
+    with pytest.raises(CheckFailedError, match="has no requirements, so it certifies nothing"):
+        check_certificate(path, [controller])
+    rows = [{"metric": "a", "holds": True}, {"metric": "b"}, {"metric": "c", "holds": None}]
+    other = tmp_path / "rows.json"
+    write_certificate(other, certificate_contents("verify", holds=False, files=files, more={"requirements": rows}))
+    assert read_certificate(other).failed_metrics() == ["b"]
+
+
+def test_a_changed_file_is_named_so_beside_one_of_another_name(tmp_path: Path) -> None:
+    one, two, path = tmp_path / "pi.npz", tmp_path / "kalman.npz", tmp_path / "both.json"
+    for file in (one, two):
+        file.write_bytes(file.name.encode())
+    files = {file.stem: (str(file), file_hash(file)) for file in (one, two)}
+    rows = [{"metric": "a", "holds": True}]
+    write_certificate(path, certificate_contents("verify", holds=True, files=files, more={"requirements": rows}))
+    one.write_bytes(b"another")
+    with pytest.raises(CheckFailedError, match=r"pi\.npz: was changed after it was certified"):
+        check_certificate(path, [one, two])

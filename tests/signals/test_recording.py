@@ -136,3 +136,9 @@ def test_angles_beyond_half_a_turn_are_taken_for_degrees() -> None:
     whole = neck_recording(100)
     with pytest.raises(DataError, match=r"channel `roll` is 20 rad at row 4, more than half a turn; is it in degrees"):
         whole.with_channels(roll=np.where(np.arange(100) == 4, 20.0, 0.0))
+
+
+def test_set_points_alone_have_outputs_that_were_not_measured() -> None:
+    alone = Recording.from_arrays(np.zeros((5, 3)))
+    assert np.isnan(alone.outputs).all()
+    assert alone.outputs.shape == (5, 2)
