@@ -157,6 +157,14 @@ def test_a_header_with_another_value_is_refused_or_everything_works(part: int, t
         assert len(said.splitlines()) <= 1, f"{header['kind']}: {place} = {value!r}: {said}"
 
 
+def test_a_predictive_controller_of_a_plant_without_gain_is_refused(tmp_path: Path) -> None:
+    """Found among 40,000 headers."""
+    header, arrays = parts(ROOT / "tests" / "golden" / "nmpc.npz")
+    write(tmp_path / "a.npz", put(header, ("found", "pitch", "static_gain"), 0), arrays)
+    with pytest.raises(FileFormatError, match="static gain of 0"):
+        load(tmp_path / "a.npz")
+
+
 def outcome(path: Path) -> str:
     """Return "" where a file is used, the line where it is refused, all of an error that is not ours."""
     try:

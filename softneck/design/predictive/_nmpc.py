@@ -394,6 +394,8 @@ class NmpcController(ReprMixin):
             given = {name: per_motor * settings.pop(name) for name in LIMITS[:4]}
         for axis in header["found"].values():
             require_whole("delay", axis["delay"], 0, _MAX_SAMPLES)
+            if axis["static_gain"] == 0.0:
+                raise FileFormatError("its header.found has a static gain of 0: the motors move nothing.")
         plant = near_rest(model, header["found"])
         return cls(
             # A file of an earlier version may not say all.
