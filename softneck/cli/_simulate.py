@@ -71,7 +71,7 @@ def command(
     from softneck.loop import System
 
     if step is not None and (loop_file.suffix.lower() != ".ssp" or robot is not None):
-        raise SettingsError(f"{loop_file}: `--step` is for SSP archives; a loop file has `sample_time_s` in each part.")
+        raise SettingsError(f"{loop_file}: `--step` is for SSP archives; a loop file states `sample_time_s`.")
     path, replace = target(output, f"results/{loop_file.stem}.csv", force=force)
     signals.recording_suffix(path)
     refuse_existing(path, force=replace)

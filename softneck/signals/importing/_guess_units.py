@@ -105,10 +105,8 @@ _TILT_CHANNELS = ("pitch", "roll", "inclination", *_REFERENCE_CHANNELS)
 _USUAL_STEP_S, _STEP_SPREAD = 0.02, 1.2
 # A sample time this far from usual is doubted; outside these bounds [s] another reading of the clock is taken.
 _FAR_STEP, _STEP_BOUNDS_S = 50.0, (0.99e-4, 600.0)
-# What a clock's numbers may be, times what the title says: s for ms, us or min, and the other way round.
-_OTHER_READINGS = (1e3, 1e-3, 1e6, 1e-6, 60.0, 1.0 / 60.0)
-# Of a clock whose title names none; minutes and more only a title can name.
-_CLOCKS = ("s", "ms", "us", "ns")
+# Of a clock whose title names none; minutes only a title can name. Where a title is doubted it may be one of these.
+_CLOCKS, _TITLED_CLOCKS = ("s", "ms", "us", "ns"), ("s", "ms", "us", "ns", "min")
 # Largest confidence, since robots differ more than the prior; the same if set-points and positions have two units.
 _MAX_CONFIDENCE, _SEPARATE_CONFIDENCE = 0.99, 0.85
 # Ratio of pitch to roll that makes their unit doubtful, and its confidence.
@@ -203,10 +201,15 @@ def _doubted_clock(unit: Unit, typical: float) -> Unit:
     step = max(typical * unit.si, 1e-9)
     if _USUAL_STEP_S / _FAR_STEP <= step <= _USUAL_STEP_S * _FAR_STEP:
         return unit
-    times = min(_OTHER_READINGS, key=lambda times: abs(log(times * step / _USUAL_STEP_S)))
-    a, b, possible = 1e3 * step, 1e3 * times * step, _STEP_BOUNDS_S[0] <= step <= _STEP_BOUNDS_S[1]
-    why = f"title and numbers disagree: {a:.4g} ms a sample, or {b:.4g} ms with numbers {times:.4g} times as large"
-    return Unit(unit.name, 1.0 if possible else times, why, _DOUBTFUL_CONFIDENCE)
+    others = {name: typical * to_si(name)[0] for name in _TITLED_CLOCKS if name != unit.name}
+    other = min(others, key=lambda name: abs(log(max(others[name], 1e-300) / _USUAL_STEP_S)))
+    why = (
+        f"an unusual sample time: {1e3 * step:.4g} ms by its title, {1e3 * others[other]:.4g} ms if its numbers "
+        f"are {other}"
+    )
+    if _STEP_BOUNDS_S[0] <= step <= _STEP_BOUNDS_S[1]:
+        return Unit(unit.name, 1.0, why, _DOUBTFUL_CONFIDENCE)
+    return Unit(other, 1.0, why, _DOUBTFUL_CONFIDENCE)
 
 
 def unread_clocks(table: SniffResult, sample_time: float) -> list[Doubt]:

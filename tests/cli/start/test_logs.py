@@ -249,7 +249,7 @@ def test_a_log_whose_titles_are_of_another_robot_is_taken_for_one_and_that_is_do
     assert "--robot-out" in facts["steps"][0]["command"]
     robot_doubt, *others = sorted(facts["doubts"]["recordings/log.layout.toml"], reverse=True)
     assert robot_doubt.startswith("robot: ")
-    # 4 s a sample may be 67 ms in minutes.
+    # 4 s a sample may be 4 ms.
     assert [doubt.partition(":")[0] for doubt in others] == ["clock"] * (write is of_tanks)
     recording = read_recording(tmp_path / "p" / "recordings" / "log.csv")
     assert recording.robot.outputs.names == outputs
