@@ -13,7 +13,7 @@ import softneck
 from softneck.core import SettingsError
 from softneck.fmu import FmuInfo, build_fmu, fmu_info
 from softneck.fmu.python import _build
-from softneck.identification import Rls, validate
+from softneck.identification import OutputError, Rls, validate
 
 from ..data import slow_but
 from .every_kind import FAMILIES, KINDS, SHORT, block_of, recording
@@ -49,6 +49,11 @@ def test_scores_of_a_validation_are_shown(tmp_path: Path) -> None:
     assert f"on {judged.rows_scored} rows of my &lt;data&gt;; {judged.rows_left_out} rows" in page
     for text in ("How it was identified", "Limits of use", "trained on 500 rows", "<td>forgetting</td>"):
         assert text in page
+
+
+@pytest.mark.parametrize("settings", [Rls(delay=0.06), OutputError(delay=0.06)])
+def test_the_dead_time_that_was_given_is_the_one_that_is_said(settings: Any) -> None:
+    assert "; dead time 0.06 s" in fmu_info(settings.fit(recording())).description
 
 
 def test_a_plant_says_what_it_is_with_its_held_out_fit() -> None:

@@ -11,6 +11,8 @@ from html import escape
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from softneck.core import KINDS, FileFormatError, SettingsError, percent, settings_text
 from softneck.design import own_controller
 from softneck.identification import Model, Validation
@@ -142,8 +144,8 @@ _KIND_LIMITS = {
 
 # Of the default experiment: 10 s of the neck.
 _SHOWN_SAMPLES = 500
-# Kinds whose array `delay` is the dead time of each output [samples].
-_DELAYED_KINDS = ("rls", "oe")
+# Kind -> the entries of its array `delay` that are dead times [samples].
+_DEAD_TIMES = {"rls": slice(None), "oe": slice(1)}
 
 
 class Buildable(Protocol):
@@ -250,8 +252,8 @@ def fmu_info(
 def _model_line(model: Model, block: Block) -> str:
     """Return what a model is, in one line: signals with units, method, sample time, dead time, fit."""
     robot = model.robot
-    delays = model.arrays.get("delay") if block.kind in _DELAYED_KINDS else None
-    dead = "" if delays is None else "/".join(f"{d * model.sample_time:.3g}" for d in sorted(set(delays.ravel())))
+    delays = np.ravel(model.arrays["delay"])[_DEAD_TIMES[model.kind]] if model.kind in _DEAD_TIMES else np.zeros(0)
+    dead = "/".join(f"{d * model.sample_time:.3g}" for d in sorted(set(delays)))
     fits = model.findings.get("hold_out", {}).get("fit", {})
     said = [
         f"plant: {len(robot.set_points)} motor set-points [{robot.motors.unit}] -> "
