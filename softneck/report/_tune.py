@@ -235,7 +235,15 @@ def failing_requirement(found: Tuned) -> str:
     if found.nearest is None:
         return f"{found.binding} fails, by the largest factor."
     sign, limit = next((b.bound, b.limit) for b in found.task.asked.bounds if b.metric == found.binding)
-    return f"Only {found.binding} fails: {found.nearest:.3g}, required {_SIGNS[sign]} {limit:.3g}."
+    value = f"{found.nearest:.3g}, required {_SIGNS[sign]} {limit:.3g}"
+    task, judged = found.task, found.verification.failed
+    failed = {verdict.requirement.metric for verdict in judged if verdict.value is not None}
+    failed |= {name for name, ratio in found.best.ratios(task.bounds, tested=task.tested).items() if ratio > 1.0}
+    if failed <= {found.binding}:
+        return f"Only {found.binding} fails: {value}."
+    return (
+        f"{found.best.kind} fails {', '.join(sorted(failed))}. Another candidate fails {found.binding} alone: {value}."
+    )
 
 
 def _result(found: Tuned, steps: Chart) -> Section:

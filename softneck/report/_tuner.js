@@ -43,7 +43,7 @@ class Tuner {
     const verdicts = this.verdicts(one), broken = this.broken(one);
     const judged = verdicts.filter(word => word !== "not computed").length, open = verdicts.length - judged;
     const which = `Candidate ${one.number} of ${this.candidates.length}, ${one.kind}${one.best ? " (best.npz)" : ""}`;
-    const rest = open ? ` ${open} were not computed by the search.` : "";
+    const rest = open ? ` Not computed by the search: ${open}.` : "";
     if (!broken.length) return `${which}, keeps all ${judged} requirements that the search computed.${rest}`;
     const list = broken.slice(0, 4).map(item => this.phrase(one, item)).join("; ");
     const more = broken.length > 4 ? `; and ${broken.length - 4} more` : "";

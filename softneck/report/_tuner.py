@@ -50,8 +50,9 @@ def tuner_page(found: Tuned, folder: Path, plants: Mapping[str, Path], *, certif
         f"The band of a step covers {where}; the line is the last of them with its heaviest payload, or the nominal "
         "plant. Values of the table are the worst of all loops of the search, some of which have noise, other "
         "directions and a later plant; the certificate covers more plants.",
-        "On a circle a lag along the path is not visible; its error in the table counts it.",
     ]
+    if panels["circle"] is not None:
+        how.append("On a circle a lag along the path is not visible; its error in the table counts it.")
     elsewhere = [f"Not computed by the search: {'; '.join(values['elsewhere'])}."] if values["elsewhere"] else []
     return page(
         f"Tune the controller for {found.task.robot.label()}",

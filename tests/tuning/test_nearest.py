@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from softneck.loop.default_limits import NECK_RISE_S
+from softneck.report._tune import failing_requirement
 from softneck.tuning._requirements import TuneRequirements, make_tune_requirements, relax_limits
 from softneck.tuning._search import Candidate
 from softneck.tuning._tune import relaxations
@@ -66,3 +69,23 @@ def test_what_somebody_asks_for_stands() -> None:
     asked = make_tune_requirements({"require": {"sim.rise_s": {"max": 0.4}}})
     assert relaxations(candidate(), [failed("sim.rise_s", 0.44, asked)], asked) == {}
     assert relaxations(candidate(), [failed("sim.rise_s", 0.6)], replace(ASKED, stated=frozenset())) != {}
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"track.circle_rms_deg": 3.7, "step.rise_s": 0.5}, "Only track.circle_rms_deg fails: 3.7, required <= 3."),
+        (
+            {"track.circle_rms_deg": 2.7, "step.rise_s": 0.7},
+            "pi fails step.rise_s. Another candidate fails track.circle_rms_deg alone: 3.7, required <= 3.",
+        ),
+    ],
+)
+def test_what_fails_is_said_of_the_controller_that_is_written(values: dict[str, float], said: str) -> None:
+    bounds = [Requirement("track.circle_rms_deg", "max", 3.0), Requirement("step.rise_s", "max", 0.55)]
+    best = Candidate(kind="pi", settings={}, x=np.zeros(0), metrics=values)
+    found: Any = SimpleNamespace(
+        holds=False, best=best, binding="track.circle_rms_deg", nearest=3.7, verification=SimpleNamespace(failed=[]),
+        task=SimpleNamespace(bounds=bounds, tested=False, asked=SimpleNamespace(bounds=bounds)),
+    )  # fmt: skip
+    assert failing_requirement(found) == said
