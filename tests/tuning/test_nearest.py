@@ -82,7 +82,10 @@ def test_what_somebody_asks_for_stands() -> None:
     ],
 )
 def test_what_fails_is_said_of_the_controller_that_is_written(values: dict[str, float], said: str) -> None:
-    bounds = [Requirement("track.circle_rms_deg", "max", 3.0), Requirement("step.rise_s", "max", 0.55)]
+    bounds = [
+        Requirement(name, "max", limit, asked=False)
+        for name, limit in (("track.circle_rms_deg", 3.0), ("step.rise_s", 0.55))
+    ]
     best = Candidate(kind="pi", settings={}, x=np.zeros(0), metrics=values)
     found: Any = SimpleNamespace(
         holds=False, best=best, binding="track.circle_rms_deg", nearest=3.7, verification=SimpleNamespace(failed=[]),
