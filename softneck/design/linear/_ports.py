@@ -217,10 +217,12 @@ def limits_of(robot: Robot, *, lead_limit: float | None, least_cocontraction: fl
     """
     motors, factor = robot.motors, to_si(robot.motors.unit)[0]
     largest, ranges = nominal_ends(robot), motor_ranges(robot, None)
-    if ranges is None or (motors.rate_limit is None and largest is None):
-        missing = "setpoint_min` and `setpoint_max" if ranges is None else "rate_limit"
+    missing = ["`motors.setpoint_min` and `setpoint_max`"] * (ranges is None)
+    missing += ["`motors.rate_limit`"] * (motors.rate_limit is None and largest is None)
+    if ranges is None or missing:
         raise SettingsError(
-            f"robot {robot.label()} gives no `motors.{missing}`, which a controller needs; add it to its robot file."
+            f"robot {robot.label()} gives no {', and no '.join(missing)}, which a controller needs; add "
+            f"{'them' if len(missing) > 1 else 'it'} to its robot file."
         )
     rates = [factor * rate for rate in motors.rate_limit or ()]
     most = float(np.abs(ranges).max())
