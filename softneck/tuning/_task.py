@@ -20,6 +20,7 @@ from softneck.core import (
     OutputFileError,
     Vector,
     atomic_write,
+    require_header,
     resolve,
     settings_text,
     to_si,
@@ -186,13 +187,36 @@ class Log:
             temporary.write_text(text + "\n", encoding="utf-8")
 
 
+_ROW = {"kind": str, "settings": str, "level": str, "error": str, "metrics": {str: (float, None)},
+        "curves": {str: [float]}}  # fmt: skip
+_CURVES = {"low", "high", "value", "reference"}
+
+
+def _check_row(row: Any, where: str) -> None:
+    """Raise an error where an evaluation lacks a key, or has a value or a curve of another shape."""
+    require_header(row, _ROW, where)
+    if absent := _ROW.keys() - {"curves"} - row.keys():
+        raise ValueError(f"{where} has no {min(absent)}")
+    curves = row.get("curves", {})
+    if curves and not curves.keys() >= _CURVES:
+        raise ValueError(f"{where}.curves has no {min(_CURVES - curves.keys())}")
+    for name, values in curves.items():
+        wanted = 1 if name == "reference" else _CIRCLE_SAMPLES if name.startswith("circle") else _CURVE_SAMPLES
+        if len(values) != wanted:
+            raise ValueError(f"{where}.curves.{name} has {len(values)} values instead of {wanted}")
+
+
 def _read(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(settings_text(path, MOST_JSON))
         if content["format"] != _LOG_FORMAT or not isinstance(content["evaluations"], list):
             raise ValueError("another format")
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise FileFormatError(f"{path}: is no log of a search that this softneck reads ({error}).") from error
+        for number, row in enumerate(content["evaluations"]):
+            _check_row(row, f"evaluations[{number}]")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, FileFormatError) as error:
+        raise FileFormatError(
+            f"{path}: is no log of a search that this softneck reads ({error}); remove it to search anew."
+        ) from error
     return content
 
 

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softneck.core import KINDS, OutputFileError, SettingsError, SoftneckError, resolve
+from softneck.core import KINDS, FileFormatError, OutputFileError, SettingsError, SoftneckError, resolve
 from softneck.core._kinds import make_settings
 from softneck.plant import NeckParameters
 from softneck.robot import Robot
@@ -23,7 +23,7 @@ from softneck.tuning import task_of, tune
 from softneck.tuning._judge import cases, judged_delay, told_conditions
 from softneck.tuning._search import Candidate, ratio, run_jobs
 from softneck.tuning._space import KINDS_SEARCHED, spaces
-from softneck.tuning._task import FILE, Job, Log
+from softneck.tuning._task import _LOG_FORMAT, FILE, Job, Log
 from softneck.tuning._tune import Tuned, active_requirement, front
 from softneck.verification import make_simulation_model
 from softneck.verification._requirements import Requirement
@@ -125,12 +125,41 @@ def test_the_folder_of_another_search_is_kept(whole: tuple[Tuned, Path], tmp_pat
         searched(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda row: row.update(curves=[1]), "curves"),
+        (lambda row: row.update(curves=None), "curves"),
+        (lambda row: row["curves"].update(low=["x"]), r"curves\.low\[0\]"),
+        (lambda row: row["curves"].update(low=[math.inf] * 80), r"curves\.low\[0\]"),
+        (lambda row: row["curves"].update(low=[0.0] * 79), r"curves\.low has 79 values instead of 80"),
+        (lambda row: row["curves"].pop("value"), "curves has no value"),
+        (lambda row: row.update(metrics={"sim.rise_s": "x"}), r"metrics\.sim\.rise_s"),
+        (lambda row: row.update(settings={}), "settings"),
+        (lambda row: row.pop("level"), "has no level"),
+    ],
+)
+def test_a_log_with_another_value_is_refused_in_one_line(tmp_path: Path, damage: Any, said: str) -> None:
+    curves = {"low": [0.0] * 80, "high": [1.0] * 80, "value": [0.5] * 80, "reference": [1.0]}
+    row = {"kind": "pi", "settings": "{}", "level": "loops", "error": "", "metrics": {"sim.rise_s": 0.5}}
+    row |= {"curves": curves}
+    file = tmp_path / FILE
+    file.write_text(json.dumps({"format": _LOG_FORMAT, "digest": "d", "evaluations": [row]}))
+    assert len(Log(tmp_path, "d").found) == 1
+    damage(row)
+    file.write_text(json.dumps({"format": _LOG_FORMAT, "digest": "d", "evaluations": [row]}))
+    with pytest.raises(FileFormatError, match=f"is no log of a search.*{said}") as refused:
+        Log(tmp_path, "d")
+    assert len(str(refused.value).splitlines()) == 1
+
+
 def test_a_log_gives_back_what_was_judged_and_has_refusals_tried_again(tmp_path: Path) -> None:
     from softneck.tuning._task import Judgement
 
     log = Log(tmp_path, "d")
     job = Job.of("pi", {"b": 1.25, "a": 1e-17 + 0.1}, "all")
-    log.found[job] = Judgement({"x": 1.0 / 3.0, "y": float("inf")}, curves={"value": [0.0, 0.1]})
+    curves = {"low": [0.0] * 80, "high": [1.0] * 80, "value": [0.1] * 80, "reference": [1.0]}
+    log.found[job] = Judgement({"x": 1.0 / 3.0, "y": float("inf")}, curves=curves)
     refused = Job.of("pi", {}, "all")
     log.found[refused] = Judgement({}, "no plant")
     log.write()
