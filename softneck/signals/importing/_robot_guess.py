@@ -293,7 +293,10 @@ def _layout(
                for name, title in channels}  # fmt: skip
     for name, title in channels:
         if to_si(sources[name].unit)[1] != si_unit(name, robot):
-            raise DataError(f"{path}: `{title}` is in {sources[name].unit}; `{name}` of robot {robot.label()} is not.")
+            raise DataError(
+                f"{path}: `{title}` is in {sources[name].unit}; `{name}` of robot {robot.label()} needs a unit of "
+                f"{si_unit(name, robot)}: take another column, or correct the title or the robot file."
+            )
     time, doubts = None, []
     if roles.time is not None:
         named, dates = table.title(roles.time), roles.time in table.dates
