@@ -173,10 +173,12 @@ def _verdict(found: Tuned) -> str:
 
 
 def tune_verdict(found: Tuned) -> str:
-    """Return the verdict on a search whose certificate holds."""
-    if not found.loosened:
-        return "All requirements hold."
-    return f"All requirements hold but {'; '.join(one.in_words(metric) for metric, one in found.loosened.items())}."
+    """Return the verdict on a search whose certificate holds; what was not computed is named and holds nothing."""
+    absent = [verdict.requirement.metric for verdict in found.verification.verdicts if verdict.value is None]
+    said = "All requirements that were computed hold" if absent else "All requirements hold"
+    if found.loosened:
+        said += f" but {'; '.join(one.in_words(metric) for metric, one in found.loosened.items())}"
+    return f"{said}; not computed: {', '.join(absent)}." if absent else f"{said}."
 
 
 def _verdicts(found: Tuned) -> list[tuple[Requirement, float | None, bool | None, str]]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from softneck.loop.default_limits import NECK_RISE_S
-from softneck.report._tune import failing_requirement
+from softneck.report._tune import failing_requirement, tune_verdict
 from softneck.tuning._requirements import TuneRequirements, make_tune_requirements, relax_limits
 from softneck.tuning._search import Candidate
 from softneck.tuning._tune import relaxations
@@ -92,3 +92,11 @@ def test_what_fails_is_said_of_the_controller_that_is_written(values: dict[str, 
         task=SimpleNamespace(bounds=bounds, tested=False, asked=SimpleNamespace(bounds=bounds)),
     )  # fmt: skip
     assert failing_requirement(found) == said
+
+
+def test_what_was_not_computed_is_not_said_to_hold() -> None:
+    known, open_ = failed("step.load_rms_deg", 0.5), replace(failed("sim.rise_s", None), holds=None)
+    found: Any = SimpleNamespace(loosened={}, verification=SimpleNamespace(verdicts=[known, open_]))
+    assert tune_verdict(found) == "All requirements that were computed hold; not computed: sim.rise_s."
+    found.verification.verdicts = [known]
+    assert tune_verdict(found) == "All requirements hold."
