@@ -137,7 +137,7 @@ def thin_charts(charts: Sequence[Chart], most: int = _MAX_SAMPLES) -> list[Chart
 
 
 def _thin_chart(chart: Chart, limit: int) -> Chart:
-    longest = max(curve.y.size for panel in chart.panels for curve in panel.curves)
+    longest = max((curve.y.size for panel in chart.panels for curve in panel.curves), default=0)
     if longest <= limit:
         return chart
     panels = [replace(panel, curves=[_thin_curve(curve, limit) for curve in panel.curves]) for panel in chart.panels]

@@ -259,7 +259,9 @@ def _result(found: Tuned, steps: Chart) -> Section:
     rows = requirement_rows(found)
     tables = [Table("Requirements", ["metric", "bound", "limit", "value", "verdict"], [row[:5] for row in rows])]
     text += tune_notes(found)
-    return Section("Best controller", charts=[steps], tables=tables, method=text)
+    # A budget that ended before any loop leaves no step to draw.
+    charts = [steps] if any(panel.curves for panel in steps.panels) else []
+    return Section("Best controller", charts=charts, tables=tables, method=text)
 
 
 def _steps(found: Tuned, items: Sequence[Candidate]) -> Chart:
