@@ -37,8 +37,6 @@ SHAPES: dict[str, dict[str, float]] = {
 }
 _ENDINGS = {"at": "s", "rise": "s", "frequency": "hz"}
 _TIMES = {"": 1.0, "s": 1.0, "ms": 1e-3, "hz": 1.0}
-# Largest angle of an output [rad]; a larger value is probably in degrees.
-_MAX_ANGLE_RAD = np.pi
 
 
 class Reference(Protocol):
@@ -233,7 +231,7 @@ def reference_range(name: str, robot: Robot) -> tuple[float, float, str]:
     outputs, motors = robot.outputs, robot.motors
     if name == "cocontraction":
         return min(motors.setpoint_min or (-np.inf,)), max(motors.setpoint_max or (np.inf,)), motors.unit
-    half = _MAX_ANGLE_RAD / to_si(outputs.unit)[0] if to_si(outputs.unit)[1] == "rad" else np.inf
+    half = robot.angle_limit / to_si(outputs.unit)[0]
     if name == "inclination":
         most = min(outputs.max or (half,))
         return -most, most, outputs.unit

@@ -25,9 +25,9 @@ _RESIDUAL_NOTE = (
     "depend on the outputs and show at negative lags."
 )
 _FIT_COLUMNS = ("model on data", "ahead", "persistence", "best linear", "model", "95 % interval", "rms", "worst")
-# A simulation has diverged beyond this [rad]; of other outputs than angles, beyond this multiple of the measured range.
-# It is not drawn from there on, so that the rest remains readable.
-_MAX_ANGLE, _MAX_RATIO = np.pi, 10.0
+# A simulation beyond half a turn, or of other outputs beyond this multiple of the measured range, is not drawn, so that
+# the rest remains readable.
+_MAX_RATIO = 10.0
 
 
 def validation_page(results: Sequence[Validation], *, title: str = "Validation") -> str:
@@ -204,7 +204,8 @@ def _name(r: Validation) -> str:
 
 def drawable(r: Validation, values: Matrix) -> Matrix:
     """Replace diverged outputs by NaN."""
-    angles = to_si(r.robot.outputs.unit)[1] == "rad"
-    most = _MAX_ANGLE if angles else _MAX_RATIO * float(np.nanmax(np.abs(r.measured), initial=0.0))
+    most = r.robot.angle_limit
+    if not np.isfinite(most):
+        most = _MAX_RATIO * float(np.nanmax(np.abs(r.measured), initial=0.0))
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(values) < most, values, np.nan)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, ReprMixin, SettingsError, Vector, require_positive
+from softneck.core import Matrix, ReprMixin, SettingsError, Vector, require_positive, to_si
 
 from . import _file
 from ._channels import Directions, Motors, Outputs, motor_channels, parse_numbered
@@ -241,6 +241,11 @@ class Robot(ReprMixin):
     def tendon_angles(self) -> Vector | None:
         """(motors,) angles of the tendons [rad]; None for a robot without tendons at known angles."""
         return np.radians(self.directions.angles_deg) if self.directions.kind == "tendons" else None
+
+    @property
+    def angle_limit(self) -> float:
+        """Largest angle of an output [rad]: half a turn where tendons bend the robot; what rotates has no limit."""
+        return np.pi if self.tendon_angles is not None and to_si(self.outputs.unit)[1] == "rad" else np.inf
 
     def redefinition(self, weights: Matrix | None = None) -> tuple[Matrix, Matrix]:
         """Return T (outputs + 1, motors) to redefined inputs and co-contraction, and its inverse (motors, outputs + 1).

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
+from softneck.robot import Robot
 from softneck.signals import Recording, concatenate
 
 from ..data import TS, neck_recording, with_time
@@ -136,6 +137,17 @@ def test_angles_beyond_half_a_turn_are_taken_for_degrees() -> None:
     whole = neck_recording(100)
     with pytest.raises(DataError, match=r"channel `roll` is 20 rad at row 4, more than half a turn; is it in degrees"):
         whole.with_channels(roll=np.where(np.arange(100) == 4, 20.0, 0.0))
+
+
+def test_what_no_tendons_bend_may_turn_more_than_once() -> None:
+    robot = Robot.from_dict({
+        "name": "stage", "sample_time_s": 0.02, "motors": {"names": ["motor_1"], "unit": "rad"},
+        "outputs": {"names": ["angle"], "unit": "rad"}, "directions": {"kind": "matrix", "matrix": [[1.0]]},
+    })  # fmt: skip
+    angle = np.linspace(0.0, 40.0, 200)
+    turned = Recording.from_arrays(np.zeros((200, 1)), angle[:, None], robot=robot)
+    np.testing.assert_array_equal(turned.outputs[:, 0], angle)
+    assert Robot.preset("neck").angle_limit == np.pi
 
 
 def test_set_points_alone_have_outputs_that_were_not_measured() -> None:

@@ -229,7 +229,9 @@ def _output_port(robot: Robot, name: str, description: str, *, missing: bool = F
     port = Port(name=name, unit=unit, description=description, missing=missing, display_unit=display)
     if unit != "rad" or missing:
         return port
-    return replace(port, minimum=-np.pi, maximum=np.pi, nominal=0.2)
+    port = replace(port, nominal=0.2)
+    most = robot.angle_limit
+    return replace(port, minimum=-most, maximum=most) if np.isfinite(most) else port
 
 
 def _motor_port(robot: Robot, name: str, description: str, *, missing: bool = False) -> Port:

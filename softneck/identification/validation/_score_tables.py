@@ -317,12 +317,11 @@ def divergence(rows: Rows, simulated: Matrix) -> list[float | None]:
     """Return for each segment the time [s] at which its simulation (time, outputs) left the data's range, or None.
 
     Left is: further than three times the measured range (the largest of the outputs', at least 5 deg of the scaled
-    ones) from its middle, an angle further than half a turn from zero, or no finite number.
+    ones) from its middle, a bent angle further than half a turn from zero, or no finite number.
     """
     unit = Scaling.of(rows.robot, set_points=None, outputs=rows.measured).output_unit
     middle, width = _range(rows.measured / unit)
-    turn = np.pi if to_si(rows.robot.outputs.unit)[1] == "rad" else np.inf
-    inside = (np.abs(simulated / unit - middle) <= RANGES * width) & (np.abs(simulated) < turn)
+    inside = (np.abs(simulated / unit - middle) <= RANGES * width) & (np.abs(simulated) < rows.robot.angle_limit)
     gone = ~inside.all(axis=1)
     first = [np.flatnonzero(gone & (rows.segment == number)) for number in range(int(rows.segment[-1]) + 1)]
     return [float(rows.time[found[0]]) if found.size else None for found in first]

@@ -253,8 +253,8 @@ def _unwrapped(samples: Samples, robot: Robot) -> tuple[Samples, tuple[str, ...]
             continue
         said = f"`{name}` jumps by a full turn at {jumps} row(s): unwrapped"
         half = np.pi * np.round(np.nanmedian(channels[name]) / np.pi)
-        if name in robot.outputs.names and half and np.nanmax(np.abs(channels[name])) > np.pi:
-            # A recording's outputs stay within half a turn; a sensor mounted upside down moves about 180 deg.
+        if name in robot.outputs.names and half and np.nanmax(np.abs(channels[name])) > robot.angle_limit:
+            # What tendons bend stays within half a turn; a sensor mounted upside down moves about 180 deg.
             channels[name] = channels[name] - half
             said += f" and counted from {np.degrees(half):g} deg, about which it moves"
         notes.append(said)

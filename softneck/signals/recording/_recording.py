@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import DataError, Matrix, ReprMixin, Vector, finite_matrix, require_between, resolve, to_si
+from softneck.core import DataError, Matrix, ReprMixin, Vector, finite_matrix, require_between, resolve
 from softneck.robot import Robot, Scaling, find_robot, round_scaled, scaled_robot
 
 from ._channels import NECK, known_channels, may_miss
@@ -276,8 +276,8 @@ class Recording(ReprMixin):
                     f"channel `{name}` is {values[row]} at row {row} (t = {self.time[row]:g} s); "
                     "it must be finite. Fix the log or cut it before that row."
                 )
-        for name in self.robot.outputs.names if to_si(self.robot.outputs.unit)[1] == "rad" else ():
-            far = np.abs(self.channels[name]) > np.pi
+        for name in self.robot.outputs.names:
+            far = np.abs(self.channels[name]) > self.robot.angle_limit
             if far.any():
                 row = int(np.argmax(far))
                 raise DataError(
