@@ -86,7 +86,7 @@ ANY: dict[str, Callable[[Recording], object]] = {
     "simulate": lambda data: whole()[1].simulate(data),
     "resampled": lambda data: resampled(data, 0.05),
     "validate": lambda data: validate(whole()[1], data),
-    "compare": lambda data: compare([whole()[1]], [data]),
+    "compare": lambda data: compare(whole()[1], data),
 }
 REFUSED: dict[str, Callable[[Recording], object]] = {
     **{f"identify {kind}": lambda data, kind=kind: identify(kind, data)
@@ -96,7 +96,7 @@ REFUSED: dict[str, Callable[[Recording], object]] = {
     "choose_kind": lambda data: choose_kind([data], name="data", train=0.7, seed=0, progress=lambda *_: None),
     "family": family,
     "frequency_response": frequency_response,
-    "make_draws": lambda data: make_draws([data]),
+    "make_draws": lambda data: make_draws(data),
 }  # fmt: skip
 
 

@@ -169,7 +169,7 @@ class Draws(ReprMixin):
 
 @one_blas_thread
 def make_draws(
-    recordings: Sequence[Recording], *, count: int = DRAWS, seed: int = 0, progress: Progress = silent
+    recordings: Recording | Sequence[Recording], *, count: int = DRAWS, seed: int = 0, progress: Progress = silent
 ) -> Draws:
     """Return draws of a robot from its recordings.
 
@@ -189,7 +189,8 @@ def make_draws(
     """
     require_whole("count", count, 2, 10_000)
     require_whole("seed", seed, 0, 2**31 - 2)
-    whole = concatenate(list(recordings))
+    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    whole = concatenate(recordings)
     second = ScaledData.of(whole).scaling.second
     train, held = _split(whole, second)
     source = _source(train, lambda done, text: progress(0.7 * done, f"draws: {text}"))

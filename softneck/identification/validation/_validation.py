@@ -423,8 +423,8 @@ _NUMERIC_COLUMNS = (
 
 
 def compare(
-    models: Mapping[str, Model] | Sequence[Model],
-    recordings: Mapping[str, Recording] | Sequence[Recording],
+    models: Model | Mapping[str, Model] | Sequence[Model],
+    recordings: Recording | Mapping[str, Recording] | Sequence[Recording],
     *,
     rules: Rules | None = None,
     progress: Progress = silent,
@@ -442,6 +442,8 @@ def compare(
         DataError: as `validate`.
     """
     rules = Rules() if rules is None else rules
+    models = [models] if isinstance(models, Model) else models
+    recordings = [recordings] if isinstance(recordings, Recording) else recordings
     named_models = _name_all(models, [m.kind for m in models] if not isinstance(models, Mapping) else [])
     named_data = _name_all(recordings, [f"data {i + 1}" for i in range(len(recordings))])
     if not named_models or not named_data:
