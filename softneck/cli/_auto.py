@@ -65,12 +65,12 @@ def identify_auto(
         if file not in saved:
             file.unlink(missing_ok=True)  # of another choice, which --force replaces
     said = [_OTHER[sort].format(kind=other.chosen.kind, path=beside[sort]) for sort, other in others.items()]
+    facts = _facts(choice, path)
     if html is not None:
-        plots.write_page(html, _page(choice), force=force)
+        plots.write_page(html, _page(choice, facts), force=force)
     judged = choice.chosen.judged
     why = None if judged is None else useless(judged)
     if as_json:
-        facts = _facts(choice, path)
         kept = {f"{name}_model": str(file) if file in saved else None for name, file in beside.items()}
         print_json({**facts, **kept})
         _refuse_useless(path, why, judged)
@@ -128,7 +128,9 @@ def _row(one: identification.KindTrial, chosen: bool) -> list[str]:
 
 
 def _facts(choice: identification.Choice, path: Path) -> dict:
-    return {
+    from softneck.report import auto_decision
+
+    facts = {
         "model": str(path),
         "chosen": choice.chosen.kind,
         "why": choice.why,
@@ -149,22 +151,40 @@ def _facts(choice: identification.Choice, path: Path) -> dict:
             for one in choice.ranking
         ],
     }
+    return {**facts, "decision": auto_decision(facts)}
 
 
-def _page(choice: identification.Choice) -> str:
-    from softneck.report import curves
+def _page(choice: identification.Choice, facts: dict) -> str:
+    from softneck.report import curves, fit_table
 
-    table = plots.Table(_title(_model(choice).robot), _TABLE_HEAD, _rows(choice))
-    names = list(dict.fromkeys(name for one in choice.ranking for name in one.scores))
-    each = [[one.kind, *(percent(one.scores.get(name)) for name in names)] for one in choice.ranking]
-    all_scores = plots.Table("Simulation fit [%] over each part that was left out", ["kind", *names], each)
-    charts = [] if choice.chosen.judged is None else [curves(choice.chosen.judged)]
-    found = _model(choice).summary().splitlines()
-    sections = [
-        plots.Section(
-            "Which kind of model", charts=charts, tables=[table, all_scores], text=choice.remarks, method=found
+    rows, scores = [], []
+    names = list(dict.fromkeys(name for one in facts["ranking"] for name in one["scores"]))
+    for one in facts["ranking"]:
+        part, error = one["worst"], one["standard_errors"].get(one["worst"])
+        said = (
+            "chosen"
+            if one["kind"] == facts["chosen"]
+            else one["failure"] or ("stopped early" if one["stopped_early"] else "")
         )
+        rows.append([one["kind"], percent(one["fit"]), plots.cell(error, ".1f"), part or "-", f"{one['numbers']:,}",
+                     f"{one['seconds']:.1f}", said])  # fmt: skip
+        scores.append([one["kind"], *(percent(one["scores"].get(name)) for name in names)])
+    head = ["kind", "worst fit [%]", "standard error", "worst on", "parameters", "tried in [s]", ""]
+    tables = [
+        plots.Table(
+            f"All kinds by their worst simulation fit, mean of {' and '.join(_model(choice).robot.outputs.names)}",
+            head,
+            rows,
+        ),
+        plots.Table("Simulation fit [%] over each part that was left out", ["kind", *names], scores),
     ]
+    judged = choice.chosen.judged
+    charts = [] if judged is None else [curves(judged)]
+    tables[:0] = [] if judged is None else [fit_table([judged])]
+    why = plots.Section(
+        f"Why {facts['chosen']}", text=[facts["why"], *facts["remarks"]], charts=charts, tables=tables,
+        method=_model(choice).summary().splitlines(),
+    )  # fmt: skip
     return plots.page(
-        "Models of all kinds, ranked", sections, verdict=choice.why, footer="Written by softneck identify auto."
+        "Which model to use", [why], verdict=facts["decision"], footer="Written by softneck identify auto."
     )

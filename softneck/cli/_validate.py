@@ -74,7 +74,10 @@ def command(
 
         plots.write_page(html, validation_page(results), force=force)
     if as_json:
-        print_json(comparison.as_dict())
+        from softneck.report import validation_decision
+
+        values = comparison.as_dict()
+        print_json({**values, "decision": validation_decision(values["models"])})
     else:
         _print(results)
     found = [f"{Path(r.model).name} on {Path(r.data).name}: {why}" for r in results if (why := useless(r))]

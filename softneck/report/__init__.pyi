@@ -10,6 +10,8 @@ from ._validation_page import validation_page as validation_page
 
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
+from ._decisions import auto_decision as auto_decision
+from ._decisions import validation_decision as validation_decision
 from ._demo import FIT_HEAD as FIT_HEAD
 from ._demo import FIT_NOTE as FIT_NOTE
 from ._demo import Demo as Demo

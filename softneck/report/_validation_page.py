@@ -11,11 +11,15 @@ from softneck.core import Matrix, to_si
 from softneck.identification import INFINITE, Validation
 from softneck.plots import Chart, Section, Table, cell, page, residual_chart, validation_chart
 
+from ._decisions import beats, fit_word, validation_decision
+
 VALIDATION_NOTE = (
     "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %, {outputs}. Persistence repeats the last sample; a one-step fit "
-    "is useful only above it. Best linear is fitted on the judged rows themselves: no linear model of the set-points "
-    "has a better simulation on them. A simulation (free run) has only the set-points as input (or the logged motors, "
-    "if requested), as an FMU of the plant does. Rows that a model was trained on are left out."
+    "is useful only above it: the verdict says whether it beats, equals or misses persistence. A simulation is very "
+    "good from 90 %, good from 80 %, fair from 70 %, poor from 30 %, else useless. Best linear is fitted on the judged "
+    "rows themselves: no linear model of the set-points has a better simulation on them. A simulation (free run) has "
+    "only the set-points as input (or the logged motors, if requested), as an FMU of the plant does. Rows that a model "
+    "was trained on are left out."
 )
 _ERROR_NOTE = "Error is measured minus predicted; rows that are not scored or not recorded are not drawn."
 _RESIDUAL_NOTE = (
@@ -24,57 +28,41 @@ _RESIDUAL_NOTE = (
     "of the model. Slow or periodic set-points spread it over many lags, negative ones too. Set-points of a controller "
     "depend on the outputs and show at negative lags."
 )
-_FIT_COLUMNS = ("model on data", "ahead", "persistence", "best linear", "model", "95 % interval", "rms", "worst")
+_FIT_COLUMNS = (
+    "model on data", "output", "ahead", "persistence", "best linear", "model", "from", "to", "rms", "worst", "verdict",
+)  # fmt: skip
 # A simulation beyond half a turn, or of other outputs beyond this multiple of the measured range, is not drawn, so that
 # the rest remains readable.
 _MAX_RATIO = 10.0
 
 
 def validation_page(results: Sequence[Validation], *, title: str = "Validation") -> str:
-    """Return the HTML page of all results, with interactive charts.
+    """Return the HTML page of all results, with interactive charts; it opens with `validation_decision`.
 
     Models that were judged on the same rows first have one chart of all their simulations.
     """
-    together = _comparisons(results)
+    together, decision = _comparisons(results), validation_decision([r.as_dict() for r in results])
     note = VALIDATION_NOTE.format(outputs="/".join(results[0].robot.outputs.names))
     charts = together or [curves(results[0])]
     sections = [Section("Fits", charts=charts, tables=[fit_table(results)], method=[note])]
     sections += [_section(r, drawn=not together and r is results[0]) for r in results]
-    return page(title, sections, verdict=_verdict(results), footer="Written by softneck validate.")
-
-
-def _verdict(results: Sequence[Validation]) -> str:
-    """Return a sentence on the best model for each recording, by the longest horizon."""
-    said = []
-    for data in dict.fromkeys(r.data for r in results):
-        rivals = [r for r in results if r.data == data]
-        best = max(rivals, key=lambda r: min(-np.inf if fit is None else fit for fit in _last(r).values()))
-        fits = ", ".join(f"{name} {cell(fit, '%')} %" for name, fit in _last(best).items())
-        ahead = list(best.fits)[-1]
-        how = "Simulation fit" if ahead == INFINITE else f"Fit {ahead} samples ahead"
-        diverged = [Path(r.model).stem for r in rivals if r.diverged is not None]
-        said.append(
-            f"{how} of {Path(best.model).stem} on {Path(data).stem}: {fits}"
-            + (f" (best of {len(rivals)} models)" if len(rivals) > 1 else "")
-            + (f"; diverged: {', '.join(diverged)}" if diverged else "")
-        )
-    return "; ".join(said) + "."
-
-
-def _last(r: Validation) -> dict[str, float | None]:
-    return r.fits[list(r.fits)[-1]]
+    return page(title, sections, verdict=decision, footer="Written by softneck validate.")
 
 
 def fit_table(results: Sequence[Validation]) -> Table:
-    """Return the fits [%] of the outputs, a row for each horizon, beside the baselines."""
-    rows, outputs = [], results[0].robot.outputs
+    """Return the fits [%], a row for each horizon and output, beside the baselines."""
+    rows = []
     for r in results:
-        for h in r.fits:
-            cells = [cell(table.get(h, {}), "%") for table in (r.persistence, r.best_linear, r.fits)]
-            ends = {axis: pair and "..".join(f"{e:.1f}" for e in pair) for axis, pair in r.intervals.get(h, {}).items()}
-            errors = [cell(ends), cell(r.rmse_deg[h], ".2f"), cell(r.worst_deg[h], ".1f")]
-            rows.append([_name(r), "simulation" if h == INFINITE else h, *cells, *errors])
-    return Table(f"Fit in %, errors in {outputs.display_unit}, {'/'.join(outputs.names)}", _FIT_COLUMNS, rows)
+        for h, fits in r.fits.items():
+            for axis, fit in fits.items():
+                beside = [cell(table.get(h, {}).get(axis), "%") for table in (r.persistence, r.best_linear)]
+                ends = r.intervals.get(h, {}).get(axis) or (None, None)
+                errors = [cell(r.rmse_deg[h][axis], ".2f"), cell(r.worst_deg[h][axis], ".1f")]
+                verdict = fit_word(fit) if h == INFINITE else beats(fit, r.persistence.get(h, {}).get(axis))
+                rows.append([_name(r), axis, "simulation" if h == INFINITE else h, *beside, cell(fit, "%"),
+                             *(cell(end, ".1f") for end in ends), *errors, verdict])  # fmt: skip
+    caption = f"Fit in % (from, to: its 95 % interval), errors in {results[0].robot.outputs.display_unit}"
+    return Table(caption, _FIT_COLUMNS, rows)
 
 
 def _comparisons(results: Sequence[Validation]) -> list[Chart]:
@@ -189,13 +177,13 @@ def _run_tables(r: Validation) -> list[Table]:
     """Return a table of the fits of each run, if there are several."""
     if len(r.per_run) < 2:
         return []
-    horizons = [str(horizon) for horizon in r.fits]
-    head = ["run", "from [s]", "rows", *("simulation" if h == INFINITE else f"{h} ahead" for h in horizons)]
+    head = ["run", "output", "from [s]", "rows", *("simulation" if h == INFINITE else f"{h} ahead" for h in r.fits)]
     rows = [
-        [str(e["run"]), f"{e['start_s']:.2f}", str(e["rows_scored"]), *(cell(e["fits"][h], "%") for h in horizons)]
-        for e in r.per_run
-    ]
-    return [Table(f"Fit [%] of each run, {'/'.join(r.robot.outputs.names)}", head, rows)]
+        [str(e["run"]), axis, f"{e['start_s']:.2f}", str(e["rows_scored"]),
+         *(cell(e["fits"][h][axis], "%") for h in r.fits)]
+        for e in r.per_run for axis in r.robot.outputs.names
+    ]  # fmt: skip
+    return [Table("Fit [%] of each run", head, rows)]
 
 
 def _name(r: Validation) -> str:

@@ -16,6 +16,7 @@ from softneck.identification.selection import _auto
 from softneck.signals import write_recording
 
 from ..data import neck_recording, recording_from
+from ..report.test_decisions import figures, is_value, opening, values_of
 from .conftest import Call
 
 
@@ -28,12 +29,13 @@ def few_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_auto_ranks_explains_and_saves(call: Call, recording: Path) -> None:
     said = call("identify", "auto", recording, "-o", "best.npz", "--html", "why.html")
     assert said.code == 0, said.err
+    page = opening(Path("why.html").read_text())
+    assert page.startswith(f"Use best.npz ({load('best.npz').kind}): on rows it has not seen it simulates pitch ")
     assert "chosen" in said.out
     assert "Simulation fit" in said.out
     assert "+-" in said.out
     assert "last one is held out" in " ".join(said.err.split())
     assert load("best.npz").kind in ("rls", "play")
-    assert "Which kind of model" in Path("why.html").read_text()
     assert call("identify", "auto", recording, "-o", "best.npz").code == 2
 
 
@@ -111,6 +113,8 @@ def test_auto_prints_one_json_object_and_holds_out_the_last_of_several(call: Cal
     assert said.code == 0, said.err
     facts = json.loads(said.out)
     assert facts["model"] == "build/models/auto.npz"
+    assert facts["decision"].startswith(f"Use build/models/auto.npz ({facts['chosen']}): ")
+    assert [figure for figure in figures(facts["decision"]) if not is_value(figure, [*values_of(facts)])] == []
     assert facts["remarks"] == []
     assert facts["chosen"] in [entry["kind"] for entry in facts["ranking"]]
     chosen = next(entry for entry in facts["ranking"] if entry["kind"] == facts["chosen"])

@@ -81,5 +81,5 @@ def test_the_page_of_a_validation_speaks_of_the_robot_s_outputs(recording: Recor
     result: Validation = validate(model, recording, include_training=True, names=("m.npz", "r.csv"))
     page = validation_page([result])
     assert "in %, x/y/z" in page
-    assert "Fit in %, errors in mm, x/y/z" in page
+    assert "Fit in % (from, to: its 95 % interval), errors in mm" in page
     assert "pitch" not in page.split('<script type="application/gzip"')[0] + charts_of(page)

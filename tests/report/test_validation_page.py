@@ -48,16 +48,16 @@ def _tables(html: str) -> list[list[list[str]]]:
 
 def test_the_page_tells_every_fit_beside_persistence(results: Sequence[Validation], html: str) -> None:
     head, *rows = _tables(html)[0]
-    assert len(rows) == sum(len(r.fits) for r in results)
-    persistence, model = head.index("persistence"), head.index("model")
-    by_name = {(row[0], row[1]): row for row in rows}
+    assert len(rows) == sum(len(fits) for r in results for fits in r.fits.values())
+    persistence, model, linear = (head.index(name) for name in ("persistence", "model", "best linear"))
+    by_name = {tuple(row[:3]): row for row in rows}
     for r in results:
-        name = f"{Path(r.model).stem} on neck"
         for horizon, fits in r.fits.items():
-            row = by_name[name, "simulation" if horizon == INFINITE else horizon]
-            assert row[model] == "/".join("-" if v is None else f"{v:.1f}" for v in fits.values())
-            held = r.persistence.get(horizon, {})
-            assert row[persistence] == "/".join("-" if v is None else f"{v:.1f}" for v in held.values())
+            for axis, fit in fits.items():
+                row = by_name[f"{Path(r.model).stem} on neck", axis, "simulation" if horizon == INFINITE else horizon]
+                held, best = r.persistence.get(horizon, {}).get(axis), r.best_linear.get(horizon, {}).get(axis)
+                for column, value in ((model, fit), (persistence, held), (linear, best)):
+                    assert row[column] == ("-" if value is None else f"{value:.1f}")
 
 
 def test_all_free_runs_come_first_and_then_each_model(html: str) -> None:
@@ -83,8 +83,11 @@ def test_one_model_or_other_rows_are_not_compared(results: Sequence[Validation],
 def test_the_verdict_names_the_model_of_the_best_free_run(results: Sequence[Validation], html: str) -> None:
     best = max(results, key=lambda r: min(-np.inf if fit is None else fit for fit in r.fits[INFINITE].values()))
     (said,) = re.findall(r'<p class="verdict ?">(.*?)</p>', html)
-    fits = ", ".join(f"{name} {fit:.1f} %" for name, fit in best.fits[INFINITE].items())
-    assert said.startswith(f"Simulation fit of {Path(best.model).stem} on neck: {fits} (best of 3 models)")
+    assert said.startswith(
+        f"Use {best.model}, the best of 3 models: on {best.rows_scored} rows of neck.csv it simulates "
+    )
+    for name, fit in best.fits[INFINITE].items():
+        assert f"{name} {fit:.1f} % (" in said
 
 
 def test_models_of_one_file_name_keep_their_folders_apart(results: Sequence[Validation]) -> None:
@@ -142,7 +145,7 @@ def test_residual_tests_and_scores_of_each_run_are_told(models: dict[str, Model]
     html = validation_page([r])
     assert "Residual tests of the one-step errors" in _headings(html)
     head, *rows = _tables(html)[1]
-    assert len(rows) == len(r.per_run) == 2
+    assert len(r.per_run) == 2
     free = head.index("simulation")
-    for row, entry in zip(rows, r.per_run, strict=True):
-        assert row[free] == "/".join(f"{fit:.1f}" for fit in entry["fits"][INFINITE].values())
+    cells = [f"{fit:.1f}" for entry in r.per_run for fit in entry["fits"][INFINITE].values()]
+    assert [row[free] for row in rows] == cells

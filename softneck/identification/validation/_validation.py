@@ -20,6 +20,7 @@ from softneck.core import (
     require_one_of,
     resolve,
     silent,
+    to_si,
 )
 from softneck.robot import Robot, load_for_robot
 from softneck.signals import Recording, RecordingLike, open_recording
@@ -156,6 +157,16 @@ class Validation(ReprMixin):
         """Whether the one-step errors follow no input at lags 0 to 25 (99 %)."""
         return self.residual_tests.uncorrelated
 
+    @property
+    def measured_range(self) -> dict[str, list[float] | None]:
+        """Output -> smallest and largest value that was scored, in its display unit; None where none was."""
+        shown = self.measured / to_si(self.robot.outputs.display_unit)[0]
+        there = np.isfinite(shown)
+        return {
+            name: [float(y[good].min()), float(y[good].max())] if good.any() else None
+            for name, y, good in zip(self.robot.outputs.names, shown.T, there.T, strict=True)
+        }
+
     def as_dict(self) -> dict[str, Any]:
         """Return the entry of the public face's JSON; of outputs in another unit than deg `rmse_deg` is `rmse`."""
         entry = self._entry()
@@ -172,6 +183,7 @@ class Validation(ReprMixin):
             "rows_scored": self.rows_scored,
             "rows_left_out": self.rows_left_out,
             "rows_by_horizon": self.rows_by_horizon,
+            "measured_range": self.measured_range,
             "fits": {
                 "persistence": self.persistence,
                 "model": self.fits,

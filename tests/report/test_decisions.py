@@ -1,0 +1,145 @@
+"""The sentences that pages open with are `decision` of the JSON, and each figure in them is one of its values."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from softneck.identification import INFINITE, Validation, validate
+from softneck.report import validation_page
+from softneck.report._decisions import (
+    auto_decision,
+    beats,
+    fit_word,
+    list_fits,
+    validation_decision,
+)
+
+from ..data import ROOT, neck_recording
+
+GOLDEN = ROOT / "tests" / "golden"
+FIGURE = re.compile(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.]*\.(?:npz|csv|toml|json))")
+
+
+def figures(text: str) -> list[str]:
+    """Return the numbers in a text, without those in names of files."""
+    return FIGURE.findall(re.sub(r"\S+\.(?:npz|csv|toml|json|html)", "", text))
+
+
+def values_of(json_values: Any) -> Iterator[float]:
+    """Yield all numbers of a JSON value, and the lengths of its lists."""
+    if isinstance(json_values, dict):
+        for item in json_values.values():
+            yield from values_of(item)
+    elif isinstance(json_values, list | tuple):
+        yield float(len(json_values))
+        for item in json_values:
+            yield from values_of(item)
+    elif isinstance(json_values, int | float):
+        yield float(json_values)
+
+
+def is_value(figure: str, known: list[float]) -> bool:
+    """Return whether a figure is one of the values, as far as its digits go."""
+    plain = figure.replace(",", "")
+    digits = len(plain.partition(".")[2])
+    # Three significant digits of `%.3g` may have no decimals.
+    return any(f"{value:.{digits}f}" == plain or f"{value:.3g}" == plain for value in known)
+
+
+def opening(page: str) -> str:
+    """Return the text of the sentence that a page opens with."""
+    (said,) = re.findall(r'<p class="verdict[^>]*>(.*?)</p>', page, re.DOTALL)
+    return html.unescape(said)
+
+
+@pytest.fixture(scope="module")
+def entry() -> dict[str, Any]:
+    linear = {"inf": {"flexion": 81.5, "twist": None}}
+    fits = {"model": {"inf": {"flexion": 77.25, "twist": 93.5}}, "best_linear": linear, "persistence": {}}
+    return {"model": "a/m.npz", "data": "log.csv", "rows_scored": 975, "fits": fits, "diverged": None, "unit": "mm",
+            "measured_range": {"flexion": [-1.25, 17.5], "twist": None}}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("fit", "word"),
+    [(90.0, "very good"), (89.9, "good"), (70.0, "fair"), (69.9, "poor"), (29.9, "useless"), (None, "no fit")],
+)
+def test_a_fit_has_a_word(fit: float | None, word: str) -> None:
+    assert fit_word(fit) == word
+
+
+@pytest.mark.parametrize(
+    ("fit", "other", "word"),
+    [(80.6, 80.0, "beats"), (80.4, 80.0, "equals"), (79.4, 80.0, "misses"), (None, 80.0, ""), (80.0, None, "")],
+)
+def test_a_fit_is_compared_with_a_baseline(fit: float | None, other: float | None, word: str) -> None:
+    assert beats(fit, other) == word
+
+
+def test_validate_decides_for_the_best_model_and_says_where_to_stop(entry: dict[str, Any]) -> None:
+    worse = {**entry, "model": "b.npz", "fits": {**entry["fits"], "model": {"inf": {"flexion": 50.0, "twist": 60.0}}}}
+    said = validation_decision([worse, entry])
+    assert said == (
+        "Use m.npz, the best of 2 models: on 975 rows of log.csv it simulates flexion 77.2 % (fair, below the best "
+        "linear fit of these rows, 81.5 %), twist 93.5 % (very good). Do not trust it beyond flexion -1.25 to 17.5 mm: "
+        "nothing larger was judged."
+    )
+    lost = {**worse, "diverged": 3.0}
+    assert "Diverged: b.npz." in validation_decision([lost, entry])
+    assert validation_decision([lost]).startswith("Do not use b.npz: ")
+    other = {**entry, "data": "two.csv"}
+    assert validation_decision([entry, other]).count("Use m.npz: ") == 2
+
+
+def test_ahead_is_judged_beside_the_last_sample(entry: dict[str, Any]) -> None:
+    fits = {"model": {"5": {"flexion": 60.0}}, "persistence": {"5": {"flexion": 71.0}}, "best_linear": {"5": {}}}
+    said = validation_decision([{**entry, "fits": fits}])
+    assert "5 samples ahead it fits flexion 60.0 % (repeating the last sample 71.0 %)" in said
+
+
+def test_auto_names_the_file_and_its_worst_test(entry: dict[str, Any]) -> None:
+    trial = {"kind": "play", "hold_out": entry, "fit": 68.75, "worst": "largest motions"}
+    facts = {"model": "models/auto.npz", "chosen": "play", "ranking": [{"kind": "oe"}, trial]}
+    said = auto_decision(facts)
+    assert said.startswith("Use models/auto.npz (play): on rows it has not seen it simulates flexion 77.2 % (fair")
+    assert said.endswith("Worst test: 68.8 % (largest motions).")
+    lost = {**entry, "fits": {**entry["fits"], "model": {"inf": {"flexion": -3.0}}}}
+    facts["ranking"][1]["hold_out"] = lost
+    assert auto_decision(facts).startswith("Do not use models/auto.npz (play): simulation fit flexion -3.0 % (useless")
+
+
+def test_fits_without_a_linear_one_have_their_word_alone() -> None:
+    assert list_fits({"x": 91.0, "y": None}) == "x 91.0 % (very good), y - % (no fit)"
+
+
+@pytest.fixture(scope="module")
+def judged() -> list[Validation]:
+    rows = neck_recording(300)
+    return [validate(GOLDEN / "rls.npz", rows, names=("rls.npz", "n.csv"), horizons=(1, INFINITE))]
+
+
+@pytest.mark.slow
+def test_the_page_opens_with_the_decision_whose_figures_are_in_the_json(judged: list[Validation]) -> None:
+    values = [one.as_dict() for one in judged]
+    page = validation_page(judged)
+    said = opening(page)
+    assert said == validation_decision(values)
+    known = [*values_of(values)]
+    assert figures(said)
+    assert [figure for figure in figures(said) if not is_value(figure, known)] == []
+    (table,) = re.findall(r"<table.*?</table>", page, re.DOTALL)[:1]
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", table, re.DOTALL)][1:]
+    assert len(rows) == sum(len(fits) for one in judged for fits in one.fits.values())
+    for row in rows:
+        for number in row[3:-1]:  # one number a cell, each of the JSON
+            assert number == "-" or is_value(number, known), row
+        if row[2] == "simulation":
+            fit = next(one for one in judged if row[0].startswith(one.model.removesuffix(".npz"))).fits[INFINITE][
+                row[1]
+            ]
+            assert row[-1] == fit_word(fit)
