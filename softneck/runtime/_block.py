@@ -27,6 +27,7 @@ class Port:
         boolean: a Boolean, carried as 0.0 or 1.0.
         integer: a whole number; Int64 in FMI 3.0, Real in FMI 2.0.
         missing: NaN is allowed and means "not measured".
+        tunable: a parameter that may change during a run.
         display_unit: unit in tools; "": the usual one for `unit`.
     """
 
@@ -40,6 +41,7 @@ class Port:
     boolean: bool = False
     integer: bool = False
     missing: bool = False
+    tunable: bool = False
     display_unit: str = ""
 
 

@@ -67,7 +67,7 @@ def _mended(data: bytes) -> bytes:
         (lambda d: d[:-1] + bytes([d[-1] ^ 1]), "its checksum is another one"),
         (lambda d: _mended(d[:-8]), "it ends too early"),
         (lambda d: _mended(d + bytes(8)), "has bytes behind its end"),
-        (lambda d: _mended(d.replace(b"_linear_controller_runtime", b"_linear_controller_runtimf")), "does not hold"),
+        (lambda d: _mended(d.replace(b"_tunable_gains_runtime", b"_tunable_gains_runtimf")), "does not hold"),
     ],
 )
 def test_a_damaged_model_file_is_refused(

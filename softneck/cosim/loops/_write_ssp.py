@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 
 from softneck.core import SI_BASES, DataError, OutputFileError, SettingsError, atomic_write, refuse_existing, to_si
-from softneck.fmu import FmuInfo, build_compiled_fmu, build_fmu, unpacked, with_modelled_drives
+from softneck.fmu import FmuInfo, build_compiled_fmu, build_fmu, exported_block, unpacked
 from softneck.loop import USE_MOTOR_POSITIONS, BlockPart, Link, Loop, Part, ReferenceBlock, System, Wiring, wire
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
@@ -298,7 +298,7 @@ def _component(name: str, part: Part, source: Path, loop: Loop | System, wiring:
 
 def _parameters(part: Part) -> tuple[Port, ...]:
     if isinstance(part, BlockPart):  # becomes an FMU of FMI 2.0, with whole numbers as Real
-        return tuple(replace(port, integer=False) for port in with_modelled_drives(part.block).parameters)
+        return tuple(replace(port, integer=False) for port in exported_block(part.block).parameters)
     return getattr(part, "parameters", ())
 
 

@@ -102,6 +102,7 @@ class Description:
             # An enumeration is the number of an item.
             integer=variable.type not in ("Real", "Float64", "Float32", "Boolean"),
             missing=variable.name in self.annotation.missing,
+            tunable=variable.variability == "tunable",
         )
 
 

@@ -2,13 +2,7 @@
 
 import numpy as np
 
-from softneck.design.linear._linear_parts_runtime import (
-    LinearArrays,
-    LinearState,
-    linear_align,
-    linear_control,
-    linear_finite,
-)
+from softneck.design.linear._linear_parts_runtime import LinearArrays, LinearState, linear_step
 from softneck.design.linear._rest_runtime import initialise as initialise
 
 
@@ -21,19 +15,4 @@ def step(p: LinearArrays, parameters: np.ndarray, x: LinearState, inputs: np.nda
     parameters: position limit [rad], slew limit [rad/s], lead limit [rad], least position of a motor [rad], least
     co-contraction [rad].
     """
-    # One that is none would stay in the state for good: the motors hold until all are there again.
-    if not linear_finite(inputs):
-        outputs[:] = x.held
-        return
-    flags = 2 * p.outputs + 1 + p.motors
-    # Whoever had the motors before: this controller takes over where they are.
-    if x.started == 0.0:
-        x.held[:] = inputs[2 * p.outputs + 1 : flags]
-    active = inputs[flags] > 0.5 and inputs[flags + 1] > 0.5
-    # Held set-points and an aligned state for as long as it may not act, so that it begins without a bump.
-    if x.started == 0.0 or not active:
-        linear_align(p, x, inputs[p.outputs + 1 : 2 * p.outputs + 1])
-    x.started = 1.0
-    if active:
-        linear_control(p, parameters, x, inputs)
-    outputs[:] = x.held
+    linear_step(p, parameters, x, inputs, outputs)

@@ -91,6 +91,28 @@ def linear_finite(inputs: np.ndarray) -> bool:
     return math.isfinite(total)
 
 
+def linear_step(
+    p: LinearArrays, parameters: np.ndarray, x: LinearState, inputs: np.ndarray, outputs: np.ndarray
+) -> None:
+    """Compute the set-points for now, and the state for the next sample."""
+    # One that is none would stay in the state for good: the motors hold until all are there again.
+    if not linear_finite(inputs):
+        outputs[:] = x.held
+        return
+    flags = 2 * p.outputs + 1 + p.motors
+    # Whoever had the motors before: this controller takes over where they are.
+    if x.started == 0.0:
+        x.held[:] = inputs[2 * p.outputs + 1 : flags]
+    active = inputs[flags] > 0.5 and inputs[flags + 1] > 0.5
+    # Held set-points and an aligned state for as long as it may not act, so that it begins without a bump.
+    if x.started == 0.0 or not active:
+        linear_align(p, x, inputs[p.outputs + 1 : 2 * p.outputs + 1])
+    x.started = 1.0
+    if active:
+        linear_control(p, parameters, x, inputs)
+    outputs[:] = x.held
+
+
 def linear_control(p: LinearArrays, parameters: np.ndarray, x: LinearState, inputs: np.ndarray) -> None:
     """One sample of filter, controller, limits and conditioning."""
     y = inputs[p.outputs + 1 : 2 * p.outputs + 1]

@@ -20,7 +20,7 @@ _MAGIC_BYTES = b"SNMODEL\0"
 FORMAT = 2
 _BYTE_ORDER_MARK = 0x01020304
 _HEAD_BYTES = 32
-_BOOLEAN, _MISSING, _INTEGER = 1, 2, 4
+_BOOLEAN, _MISSING, _INTEGER, _TUNABLE = 1, 2, 4, 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ class _Writer:
         self.text("1" if port.boolean else port.unit)
         low = -np.inf if port.minimum is None else float(port.minimum)
         high = np.inf if port.maximum is None else float(port.maximum)
-        flags = _BOOLEAN * port.boolean | _MISSING * port.missing | _INTEGER * port.integer
+        flags = _BOOLEAN * port.boolean | _MISSING * port.missing | _INTEGER * port.integer | _TUNABLE * port.tunable
         self.plain("<3dI", float(port.start), low, high, flags)
 
     def node(self, node: Node) -> None:

@@ -115,7 +115,7 @@ def _row(port: Port, word: str) -> str:
     start = "" if word == "output" else f"{bool(port.start)}".lower() if port.boolean else f"{port.start:g}"
     unit = "Boolean" if port.boolean else port.unit
     note = " NaN: not measured." if port.missing else ""
-    cells = (port.name, word, unit, start, span, port.description + note)
+    cells = (port.name, f"tunable {word}" if port.tunable else word, unit, start, span, port.description + note)
     return "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"
 
 

@@ -22,6 +22,7 @@ from softneck.robot import is_set_point, motor_positions_among
 from softneck.runtime import Block, Port
 
 from ._describe import FmuInfo
+from ._tunable import with_tunable_gains
 
 _DRIVES_RUNTIME = "softneck.fmu.describe._modelled_drives_runtime"
 # Index of the first motor position in a neck's controller, and number of motors: the defaults of the runtime.
@@ -106,8 +107,8 @@ class Identity:
 
 
 def exported_block(block: Block) -> Block:
-    """Return `block` as in its FMU: controllers with a model of the drives, references with a range."""
-    whole = with_modelled_drives(block)
+    """Return `block` as in its FMU: with tunable gains, a model of the drives, a range of references."""
+    whole = with_modelled_drives(with_tunable_gains(block))
     return replace(whole, inputs=tuple(_with_reference_range(port) for port in whole.inputs))
 
 
@@ -242,7 +243,7 @@ def _variables(root: Element, block: Block, fmi: int) -> None:
 def _variable(table: Element, port: Port, causality: str, reference: int, fmi: int) -> None:
     variability = {"input": "discrete" if port.boolean else "continuous", "output": "discrete", "parameter": "fixed"}
     head = {"name": port.name, "valueReference": str(reference), "causality": causality}
-    head["variability"] = variability[causality]
+    head["variability"] = "tunable" if port.tunable else variability[causality]
     if causality != "input":
         head["initial"] = "calculated" if causality == "output" else "exact"
     if port.description:

@@ -153,6 +153,7 @@ def _port_facts(port: Port) -> dict[str, Any]:
         "low": float("-inf") if port.minimum is None else float(port.minimum),
         "high": float("inf") if port.maximum is None else float(port.maximum),
         "missing": port.missing,
+        "tunable": port.tunable,
     }
 
 

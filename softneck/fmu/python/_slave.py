@@ -273,12 +273,12 @@ class SoftneckSlave(Fmi2Slave):
                 self._warn_outside(port, value)
         elif reference < self.n_known:
             raise ValueError(f"{port['name']} is an output and cannot be set.")
-        elif self.running:
+        elif self.running and not port["tunable"]:
             raise ValueError(f"{port['name']} is fixed; set it before the initialisation ends.")
         elif outside:
             text = f"between {port['low']:g} and {port['high']:g} [{port['unit']}]"
             raise ValueError(f"{port['name']} must be {text}; it was set to {value:g}.")
-        else:
+        elif not self.running:
             self.stale = True
         self.variables[reference] = value
 

@@ -232,7 +232,7 @@ static int sn_begin(sn_instance *s, double start, double stop)
     return 1;
 }
 
-/* From here on parameters are fixed. */
+/* From here on parameters are fixed, but for tunable ones. */
 static int sn_run(sn_instance *s)
 {
     if (!sn_initialise(s))
@@ -485,15 +485,17 @@ SN_APART static int sn_set_rarely(sn_instance *s, uint32_t i, double value)
     } else if (i < known) {
         sn_say(s, SN_FAIL, "%.80s is an output and cannot be set.", port->name);
         return 0;
-    } else if (s->running) {
+    } else if (s->running && !(port->flags & SN_TUNABLE)) {
         sn_say(s, SN_FAIL, "%.80s is fixed; set it before the initialisation ends.", port->name);
         return 0;
     } else if (outside) {
         sn_say(s, SN_FAIL, "%.80s must be between %g and %g [%.20s]; it was set to %g.", port->name, port->low,
                port->high, port->unit, value);
         return 0;
-    } else {
+    } else if (!s->running) {
         s->stale = 1;
+    } else if (s->seen.n > 0) { /* a sample of this event is taken anew, as for other inputs: none was like this NaN */
+        s->seen.p[0] = sn_from_bits(0x7ff8000000000001u);
     }
     s->values.p[i] = value;
     s->looked = 0;

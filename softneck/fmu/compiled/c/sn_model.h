@@ -20,7 +20,7 @@
 #define SN_MOST_STATES (1 << 24)
 #define SN_TEXT 400
 
-enum { SN_BOOLEAN = 1, SN_MISSING = 2, SN_INTEGER = 4 };
+enum { SN_BOOLEAN = 1, SN_MISSING = 2, SN_INTEGER = 4, SN_TUNABLE = 8 };
 
 typedef struct { const char *name, *unit; double start, low, high; unsigned flags; } sn_port;
 

@@ -29,6 +29,7 @@ _NECK_RUNTIMES = (
     "softneck.design.varying._adaptive_runtime",
     "softneck.design.predictive._mpc_runtime",
     "softneck.fmu.describe._modelled_drives_runtime",
+    "softneck.fmu.describe._tunable_gains_runtime",
     "softneck.loop._reference_runtime",
 )
 # Runtimes for robots of any size, in addition to those above, whose sizes are the neck's and known at compile time.
@@ -46,6 +47,7 @@ _ROBOT_RUNTIMES = (
     "softneck.design.linear._linear_controller_runtime",
     "softneck.design.varying._adaptive_runtime",
     "softneck.design.predictive._mpc_runtime",
+    "softneck.fmu.describe._tunable_gains_runtime",
     "softneck.loop._reference_runtime",
 )
 RUNTIMES = (*_NECK_RUNTIMES, *(f"{module}@{ANY_SIZE}" for module in _ROBOT_RUNTIMES))
@@ -57,7 +59,7 @@ _SIZE = re.compile(r"[1-8]x[1-4]")
 
 _SIZED = frozenset(module for module in RUNTIMES if module.endswith(f"@{ANY_SIZE}"))
 _DRIVES = frozenset({"softneck.fmu.describe._modelled_drives_runtime"})
-_CONTROL = _DRIVES | {m for m in RUNTIMES if ".design." in m or "kalman" in m or ".loop." in m}
+_CONTROL = _DRIVES | {m for m in RUNTIMES if ".design." in m or "gains" in m or "kalman" in m or ".loop." in m}
 # Observers are in both parts for models, the modelled drives in both parts for controllers.
 _OBSERVERS = frozenset(module for module in RUNTIMES if ".estimation." in module) - _CONTROL
 # Parts of the library: an FMU contains the part with all its kinds, half as large as the whole.
