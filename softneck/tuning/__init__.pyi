@@ -9,6 +9,5 @@ from ._task import curve_times as curve_times
 from ._task import has_observer as has_observer
 from ._tune import Loosened as Loosened
 from ._tune import Tuned as Tuned
-from ._tune import loops_start as loops_start
 from ._tune import objectives as objectives
 from ._tune import task_of as task_of

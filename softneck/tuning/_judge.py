@@ -36,8 +36,10 @@ from softneck.verification import (
     margins,
     run_steps,
     sources_of,
+    start_of,
     step_loop,
     step_time,
+    without_lead,
 )
 
 from ._requirements import TuneRequirements, can_follow_circle, default_payloads
@@ -373,20 +375,24 @@ def loop_curves(
         for case in ready.all:
             plain = not (case.noise or case.late) and case.part == 1.0 and case.orientation == along
             if case.circle or plain:
-                result = run_loop(loop_of(case, ready.own[case.plant], block, order, task, observer), compiled=True)
+                loop = loop_of(case, ready.own[case.plant], block, order, task, observer)
+                result = without_lead(run_loop(loop, compiled=True), loop.reference)
                 (circles if case.circle else steps).append(result)
     except DataError:
         return {}
     shown, time = task.asked.certificate.scale.shown, curve_times(task)
     name = task.robot.outputs.names[0]
     reference = steps[-1][f"{name}_reference"]
+    before = float(reference[0])
     after = [result.time - result.time[np.argmax(result[f"{name}_reference"] != result[f"{name}_reference"][0])]
              for result in steps]  # fmt: skip
-    y = np.array([np.interp(time, t, shown(result.angle(name))) for t, result in zip(after, steps, strict=True)])
+    y = np.array(
+        [np.interp(time, t, shown(result.angle(name) - before)) for t, result in zip(after, steps, strict=True)]
+    )
     P = np.column_stack([steps[-1][motor] for motor in task.robot.set_points])
     # A set-point is held until the next sample.
     rows = np.clip(np.searchsorted(after[-1], time + 1e-9, side="right") - 1, 0, len(P) - 1)
-    found = _step_curves(task, ready, y, P[rows]) | {"reference": [_rounded(shown(reference[-1]))]}
+    found = _step_curves(task, ready, y, P[rows]) | {"reference": [_rounded(shown(reference[-1] - before))]}
     if circles:
         r = np.array([_radius(result, task) for result in circles])
         found |= {"circle_low": r.min(axis=0), "circle_high": r.max(axis=0), "circle": r[-1]}
@@ -421,7 +427,8 @@ def _step_curves(task: Task, ready: Ready, y: np.ndarray, P: np.ndarray) -> dict
 def _radius(result: LoopResult, task: Task) -> Vector:
     """Return the radius of the last turn at `circle_angles`, in the display unit."""
     turn = round(2.0 * math.pi / task.asked.track["circle_rad_s"] / result.sample_time)
-    x, y = (task.asked.certificate.scale.shown(result.angle(name)[-turn:]) for name in task.robot.outputs.names)
+    x, y = (task.asked.certificate.scale.shown(result.angle(name)[-turn:] - there)
+            for name, there in zip(task.robot.outputs.names, start_of(task.robot), strict=True))  # fmt: skip
     return np.interp(circle_angles(), np.arctan2(y, x), np.hypot(x, y), period=2.0 * math.pi)
 
 

@@ -205,24 +205,13 @@ def task_of(plants: Any, requirements: TuneRequirements | Mapping[str, Any] | st
     drawn = {
         f"{name}, draw {k + 1}": model for name, thing in linear.items() if getattr(thing, "draws", None) is not None
         for k, model in enumerate(thing.draws.for_search(_SEARCHED_DRAWS))
-    } if loops_start(robot) else {}  # fmt: skip
+    }  # fmt: skip
     own |= drawn
-    if own and not loops_start(robot):
-        name = next(iter(own))
-        raise SettingsError(
-            f"loops over {name} start at zero, outside the range of {robot.label()}; give linear plants only."
-        )
     asked = _read_requirements(requirements, robot, list(linear.values()), stepping=bool(own))
     return Task(
         digest="", linear=linear, own=own, asked=asked, robot=robot, seed=seed,
         cocontraction=_recorded_cocontraction(linear, robot), drawn=tuple(drawn),
     )  # fmt: skip
-
-
-def loops_start(robot: Robot) -> bool:
-    """Return whether the range of the outputs contains zero, where loops start."""
-    ends = zip(robot.outputs.min or (), robot.outputs.max or (), strict=True)
-    return all(low <= 0.0 <= high for low, high in ends)
 
 
 def _read_requirements(requirements: Any, robot: Robot, linear: list[Any], *, stepping: bool) -> TuneRequirements:

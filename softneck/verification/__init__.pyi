@@ -32,8 +32,10 @@ from ._neck_loops import loops_under_test as loops_under_test
 from ._neck_loops import make_simulation_model as make_simulation_model
 from ._neck_loops import named_plants as named_plants
 from ._neck_loops import neck_file_of as neck_file_of
+from ._neck_loops import start_of as start_of
 from ._neck_loops import step_loop as step_loop
 from ._neck_loops import step_time as step_time
+from ._neck_loops import without_lead as without_lead
 from ._page import verdict_table as verdict_table
 from ._plants import Plants as Plants
 from ._plants import all_plants as all_plants

@@ -31,7 +31,16 @@ from ._experiments import (
     bisect,
     scale_loop_gain,
 )
-from ._neck_loops import SimulationModel, direction, make_simulation_model, step_metrics, step_time
+from ._neck_loops import (
+    AroundMiddle,
+    SimulationModel,
+    direction,
+    make_simulation_model,
+    rows_of,
+    step_metrics,
+    step_time,
+    without_lead,
+)
 from ._requirements import Requirements
 
 _CONFIDENCE = 0.95
@@ -230,13 +239,14 @@ def _step(task: _Task, plant: SimulationModel, number: int, kg: float, orientati
     half = float(asked.sim["duration_s"])
     size = scale.si(float(asked.sim["size_deg"]))
     shares = direction(orientation, robot)
+    step = RobotReference(kind="step", values=tuple(size * s for s in shares), at=at)
     block, connections = scale_loop_gain(task.controller, task.observer, outputs)
     parameters = {f"share_{axis}": float(s) for axis, s in zip(outputs, draws.share, strict=True)}
     parameters |= {"keep": draws.keep, "noise": scale.si(float(asked.step["noise_deg"])), "noise_seed": float(number)}
     loop = Loop(
         plant=plant.quiet(task.controller.sample_time), controller=BlockPart(task.controller),
         observer=None if task.observer is None else BlockPart(task.observer),
-        reference=RobotReference(kind="step", values=tuple(size * s for s in shares), at=at),
+        reference=AroundMiddle.of(step, task.controller, asked),
         duration=at + half + (half if _has_load(task) else 0.0), order=task.order, robot=robot,
         **plant.carrying(kg), others={"louder": BlockPart(block)}, other_parameters={"louder": parameters},
         connections=connections, faults=tuple(_load(task, int(np.argmax(np.abs(shares))), at + half)),
@@ -249,7 +259,7 @@ def _step(task: _Task, plant: SimulationModel, number: int, kg: float, orientati
         result = None
     names = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "slack_s")
     rows = 0 if result is None else round((at + half) / result.sample_time)
-    values = step_metrics(None if result is None else _rows(result, 0, rows))
+    values = step_metrics(None if result is None else without_lead(rows_of(result, 0, rows), loop.reference))
     found = {f"sim.{name_of(name)}": values[name] for name in names if not math.isnan(values[name])}
     if _has_load(task):
         found[f"sim.{name_of('load_rms_deg')}"] = math.inf if result is None else _load_rms(result, rows, asked)
@@ -277,13 +287,6 @@ def _with_disturbance(result: LoopResult) -> LoopResult:
         seen = next(key for key in result.signals if key.endswith(f"{name}_measured_seen"))
         own[name] = result.signals[seen]
     return replace(result, signals={**result.signals, **own})
-
-
-def _rows(result: LoopResult, first: int, stop: int) -> LoopResult:
-    return replace(
-        result, time=result.time[first:stop],
-        signals={name: values[first:stop] for name, values in result.signals.items()},
-    )  # fmt: skip
 
 
 def _load_rms(result: LoopResult, first: int, asked: Requirements) -> float:

@@ -24,6 +24,7 @@ from ._neck_loops import (
     neck_changes,
     preset_of,
     run_loops,
+    start_of,
     step_time,
     why_no_virtual_plant,
 )
@@ -317,11 +318,12 @@ def _neck_describer(evidence: Evidence, controller: ControllerUnderTest, asked: 
         run, at = evidence.necks[row], step_time(controller.block, asked)
         size = float(asked.sim["size_deg"])
         parameters = {} if run.parameters is None else neck_changes(run.parameters, controller.robot)
+        middle, shares = start_of(controller.robot), direction(run.orientation, controller.robot)
         return {
             "kind": "own" if run.parameters is None else "neck", "name": run.name, "parameters": parameters,
             "payload_kg": run.payload,
-            **{f"{name}_{error_unit(controller.robot)[0]}": size * share for name, share in
-               zip(controller.robot.outputs.names, direction(run.orientation, controller.robot), strict=True)},
+            **{f"{name}_{error_unit(controller.robot)[0]}": float(asked.scale.shown(there)) + size * share
+               for name, there, share in zip(controller.robot.outputs.names, middle, shares, strict=True)},
             "seed": run.seed, "at_s": at, "duration_s": at + float(asked.sim["duration_s"]),
             "sample_time_s": controller.block.sample_time, "order": controller.order,
         }  # fmt: skip

@@ -29,7 +29,7 @@ _LOOP_GAIN_RUNTIME = "softneck.verification._louder_runtime"
 _NECK = Robot.preset()
 _BUFFER_SAMPLES = 34
 # The experiment [s]: time to reach the posture, time of the step, a transient, and each of two windows.
-_LEAD_IN_S, _REST_S, _TRANSIENT_S, _WINDOW_S = 1.0, 3.0, 2.0, 4.0
+LEAD_IN_S, REST_S, _TRANSIENT_S, _WINDOW_S = 1.0, 3.0, 2.0, 4.0
 # Steps and lean of a posture, within reach of every neck with a payload.
 _SMALL_RAD, _LARGE_RAD = math.radians(1.0), math.radians(8.0)
 _LEAN_RAD = math.radians(5.0)
@@ -272,7 +272,7 @@ class Experiment:
             return 0.0, math.inf
         rows = round(_WINDOW_S * self.loop.time / result.sample_time)
         angles = np.stack([result[name] for name in self.loop.outputs])
-        kicked = angles[:, result.time >= self.loop.time * _REST_S]
+        kicked = angles[:, result.time >= self.loop.time * REST_S]
         if (gain, delay) == (1.0, 0.0) and np.ptp(kicked, axis=1).max() <= _RESPONSE_SHARE * self.amplitude:
             return 0.0, math.inf  # no response, such as with motors at their limits: no margin can be found
         parts = angles[:, -2 * rows : -rows], angles[:, -rows:]
@@ -294,7 +294,7 @@ class Experiment:
                 plant=loop.plant(), controller=BlockPart(loop.controller),
                 observer=None if loop.observer is None else BlockPart(loop.observer),
                 reference=_Kicked(posture, tuple(float(v) for v in kick), loop.time, middle), robot=loop.robot,
-                duration=loop.time * (_REST_S + _TRANSIENT_S + 2.0 * _WINDOW_S), order=loop.order,
+                duration=loop.time * (REST_S + _TRANSIENT_S + 2.0 * _WINDOW_S), order=loop.order,
                 **loop.constants, other_parameters={"louder": parameters},
                 others={"louder": BlockPart(block)}, connections=connections,
                 # The reference of a rate is zero.
@@ -315,6 +315,11 @@ def _oscillation(angle: Vector, away: float) -> float:
     return far if far >= away else min(rise, fall)
 
 
+def smooth_rise(time: float, seconds: float) -> float:
+    """Return the part of a motion from 0 to 1 in `seconds` that is done at `time` [s]."""
+    return 0.5 - 0.5 * math.cos(math.pi * min(1.0, time / seconds))
+
+
 @dataclass(frozen=True, slots=True)
 class _Kicked:
     """A smooth motion to a posture, then a step."""
@@ -325,8 +330,8 @@ class _Kicked:
     together: float = 0.0
 
     def __call__(self, time: float) -> tuple[float, ...]:
-        led = 0.5 - 0.5 * math.cos(math.pi * min(1.0, time / (self.slower * _LEAD_IN_S)))
-        on = float(time >= self.slower * _REST_S)
+        led = smooth_rise(time, self.slower * LEAD_IN_S)
+        on = float(time >= self.slower * REST_S)
         return *(
             led * there + on * away for there, away in zip(self.posture, self.kick, strict=True)
         ), led * self.together

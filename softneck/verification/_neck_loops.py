@@ -5,25 +5,25 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
-from softneck.core import DataError, Progress, SettingsError, SoftneckError, to_si, worst
+from softneck.core import DataError, Progress, SettingsError, SoftneckError, Vector, to_si, worst
 from softneck.cosim import FmuPart
 from softneck.estimation import robot_of
-from softneck.loop import BlockPart, Loop, LoopResult, Part, RobotReference, metrics, run_loop
+from softneck.loop import BlockPart, Loop, LoopResult, Part, Reference, RobotReference, metrics, run_loop
 from softneck.plant import PRESETS, NeckParameters, VirtualNeck
 from softneck.robot import Robot, Scaling, load_for_robot
 from softneck.runtime import Block
 
-from ._experiments import LoopUnderTest, connections_without_preview
+from ._experiments import LEAD_IN_S, REST_S, LoopUnderTest, connections_without_preview, smooth_rise
 from ._metrics import Scale
 from ._requirements import Requirements
-from ._steps import Steps
+from ._steps import Steps, middle_motors, middle_of
 
 # Set by hand: the pretension changes by some 3 %.
 _COCONTRACTION_TOLERANCE_RAD = 0.1
@@ -279,7 +279,52 @@ def direction(orientation: float, robot: Robot) -> tuple[float, ...]:
 def step_time(controller: Block, asked: Requirements) -> float:
     """Return the time of the step [s]."""
     pulls = any(port.name == "least_cocontraction" and (port.start or 0.0) > 0.0 for port in controller.parameters)
-    return asked.scale.time * (_STEP_AT_TAUT_S if pulls else _STEP_AT_S)
+    away = start_of(asked.robot).any()
+    return asked.scale.time * (REST_S if away else _STEP_AT_TAUT_S if pulls else _STEP_AT_S)
+
+
+def start_of(robot: Robot) -> Vector:
+    """Return the outputs (outputs,) [SI] from which loops step: their middle, but zero where tendons bend to it."""
+    ends = zip(robot.outputs.min or (), robot.outputs.max or (), strict=True)
+    upright = robot.tendon_angles is not None and all(low <= 0.0 <= high for low, high in ends)
+    return np.zeros(len(robot.outputs.names)) if upright else middle_of(robot)
+
+
+@dataclass(frozen=True, slots=True)
+class AroundMiddle:
+    """A smooth motion to `outputs` and `cocontraction` [SI] over `lead` [s], to which a reference is added."""
+
+    reference: Reference
+    outputs: tuple[float, ...]
+    cocontraction: float
+    lead: float
+
+    @classmethod
+    def of(cls, reference: Reference, controller: Block, asked: Requirements) -> Reference:
+        """Return a reference about the middle of the robot; as it is where loops start there."""
+        start = start_of(asked.robot)
+        if not start.any():
+            return reference
+        common = float(middle_motors(asked.robot, controller).mean())
+        return cls(reference, tuple(start.tolist()), common, asked.scale.time * LEAD_IN_S)
+
+    def __call__(self, time: float, /) -> tuple[float, ...]:
+        """Return the reference at `time` [s]: all outputs, then co-contraction."""
+        led, (*values, common) = smooth_rise(time, self.lead), self.reference(time)
+        moved = (led * there + value for there, value in zip(self.outputs, values, strict=True))
+        return (*moved, common or led * self.cocontraction)
+
+
+def without_lead(result: LoopResult, reference: object) -> LoopResult:
+    """Return the rows of a result after the motion to the middle, if the reference begins with one."""
+    first = int(np.searchsorted(result.time, reference.lead)) if isinstance(reference, AroundMiddle) else 0
+    return rows_of(result, first, result.time.size) if first else result
+
+
+def rows_of(result: LoopResult, first: int, stop: int) -> LoopResult:
+    """Return rows `first` to `stop` of a result."""
+    signals = {name: values[first:stop] for name, values in result.signals.items()}
+    return replace(result, time=result.time[first:stop], signals=signals)
 
 
 def run_loops(
@@ -343,7 +388,8 @@ def step_loop(
     """Return the loop over a part of a simulation model."""
     return Loop(
         plant=part, controller=BlockPart(controller), observer=None if observer is None else BlockPart(observer),
-        reference=reference, duration=duration, order=order, robot=asked.robot, **plant.carrying(payload),
+        reference=AroundMiddle.of(reference, controller, asked), duration=duration, order=order, robot=asked.robot,
+        **plant.carrying(payload),
         faults=tuple(faults),
         connections=connections_without_preview(controller),
     )  # fmt: skip
@@ -361,7 +407,7 @@ def judge_loop(
     except DataError:
         # Overflow: the loop is unstable.
         return step_metrics(None), None
-    return step_metrics(result, angle=angle), result
+    return step_metrics(without_lead(result, loop.reference), angle=angle), result
 
 
 def step_metrics(result: LoopResult | None, *, angle: str = "true") -> dict[str, float]:
@@ -370,7 +416,7 @@ def step_metrics(result: LoopResult | None, *, angle: str = "true") -> dict[str,
         return dict.fromkeys((*_AXIS_METRICS, *_MOTOR_METRICS), math.inf)
     table, robot = metrics(result, angle=angle), result.robot
     names = Scale(robot=robot).name_of
-    sizes = {axis: float(np.abs(result[f"{axis}_reference"]).max()) for axis in robot.outputs.names}
+    sizes = {axis: float(np.ptp(result[f"{axis}_reference"])) for axis in robot.outputs.names}
     stepped = [axis for axis, size in sizes.items() if size > _STEPPED_SHARE * max(sizes.values())]
     values = {}
     for name in _AXIS_METRICS:

@@ -9,9 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from softneck.core import KINDS, DataError, SettingsError, resolve
+from softneck.core import KINDS, DataError, SettingsError, resolve, silent
 from softneck.cosim import FmuPart
 from softneck.design import PiSettings
 from softneck.fmu import build_fmu
@@ -23,11 +24,11 @@ from softneck.tuning._judge import loop_of, prepare
 from softneck.tuning._requirements import check_feasibility, make_tune_requirements, relax_limits
 from softneck.tuning._space import spaces
 from softneck.tuning._tune import Tuned, task_of
-from softneck.verification import read_requirements
+from softneck.verification import make_simulation_model, read_requirements, start_of
 from softneck.verification._metrics import Scale
-from softneck.verification._neck_loops import direction
+from softneck.verification._neck_loops import direction, run_loops
 from softneck.verification._verify import sources_of
-from tests.design.test_robots import BELLOWS, plant
+from tests.design.test_robots import BELLOWS, LEARNED, TS, plant
 
 QUICK: dict[str, Any] = {"sampling": {"plants": 12, "search_generations": 0}, "step": {"duration_s": 2.0},
                          "sim": {"duration_s": 2.5}, "track": {"noise_deg": 0.0}}  # fmt: skip
@@ -152,11 +153,34 @@ def test_a_plant_of_another_robot_is_refused_before_anything_is_searched(tmp_pat
         tune(
             {"model": plant(Robot.preset("trunk4")), "own": plant(Robot.preset("antagonist")).block()}, folder=tmp_path
         )
-    with pytest.raises(
-        SettingsError, match=r"start at zero, outside the range of `bellows` \(\w{8}\); give linear plants only"
-    ):
-        tune({"model": plant(BELLOWS), "own": plant(BELLOWS).block()}, folder=tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_loops_step_from_where_the_robot_is_operated() -> None:
+    """A sensor that reads 50 mm more moves the range by as much, and changes no metric of a step."""
+    values = []
+    for shift in (0.0, 50.0):
+        outputs = replace(BELLOWS.outputs, min=(shift - 10.0,) * 3, max=(shift + 10.0,) * 3)
+        robot = replace(BELLOWS, outputs=outputs)
+        model, gain = plant(robot, gain=5e-8), 5e-8  # [m/Pa]
+        offset = shift / 1e3 - gain * LEARNED @ np.full(4, 1.5e5)  # in the middle at 1.5 bar
+        model = replace(model, arrays={**model.arrays, "offset": offset})
+        controller = PiSettings().design(model)
+        asked = task_of({"model": model, "own": model.block()}, QUICK, 0).asked.certificate
+        assert start_of(robot) == pytest.approx(np.full(3, shift / 1e3))
+        runs = run_loops(
+            controller.block(), asked, order="sequential", observer=None, seed=0, progress=silent,
+            own=[make_simulation_model(model.block(), "own", robot)],
+        )  # fmt: skip
+        values.append([run.metrics for run in runs])
+        for run in runs:
+            assert run.metrics["rise_s"] < 2.0
+            assert run.metrics["steady_rms_deg"] < 0.05 * asked.sim["size_deg"]
+    # Without shift loops start at the middle at once; with it, they move there before, to 1 % of the step.
+    for at_once, moved in zip(*values, strict=True):
+        assert moved["rise_s"] == pytest.approx(at_once["rise_s"], abs=2.0 * TS)
+        assert moved["overshoot_pct"] == pytest.approx(at_once["overshoot_pct"], abs=1.0)
 
 
 def test_every_step_is_judged_as_verify_does_and_with_a_noisy_sensor_each_direction_its_own() -> None:

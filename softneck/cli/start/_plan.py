@@ -10,9 +10,9 @@ from enum import Enum
 from math import isclose
 from pathlib import Path
 
-from softneck import signals, tuning
+from softneck import signals
 from softneck.core import MOST_TOML, SettingsError, settings_text
-from softneck.robot import Robot, find_robot
+from softneck.robot import Robot
 
 from ..shared._console import note
 from ._possible import FILE, backend, lacking, possible, propose_missing, require_known
@@ -237,8 +237,6 @@ def _controller(options: Options) -> Iterator[Step]:
     family = Path(FAMILY).is_file()
     linear, nonlinear = FAMILY if family else linear_model(), nonlinear_model()
     plants = (linear, nonlinear or linear_model()) if family or nonlinear else (linear,)
-    if not tuning.loops_start(find_robot(beside=Path("robot.toml"))):
-        plants = (linear,)
     kinds = options.kinds or (_CONTROLLER_KINDS if family else _CONTROLLER_KINDS + _KINDS_WITHOUT_FAMILY)
     # Requirements of the user stay; infeasible defaults are left out, and the step fails.
     finding = possible(plants) if options.requirements is None else ""

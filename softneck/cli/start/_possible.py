@@ -104,6 +104,8 @@ def impossible(plants: tuple[str, ...]) -> dict[str, str]:
             return refused
 
 
+#: Value, certainty in %, reason.
+Entry = tuple[float | list[float], int, str]
 # Noise of a channel without noise, relative to its range: a sensor of 1,000 levels.
 _LEAST_NOISE_RATIO = 1e-3
 
@@ -121,17 +123,35 @@ def propose_missing(file: Path, recordings: Sequence[Recording], *, motors: bool
         "rate_hz": (_digits(1.0 / recordings[0].sample_time), 80, "one measurement a sample of the recordings"),
     }
     proposed: list[str] = []
-    for name, found in (("motors", _limits(robot, recordings) if motors else {}), ("sensor", sensor)):
+    limits, (motor_rest, output_rest) = _limits(robot, recordings) if motors else {}, _rest(robot, recordings)
+    for name, found in (("motors", limits | motor_rest), ("outputs", output_rest), ("sensor", sensor)):
         missing = {key: entry for key, entry in found.items() if key not in told.get(name, {})}
         if missing:
             _add(file, name, missing)
-            said = ", ".join(f"{key} = {value:g}" for key, (value, *_) in missing.items())
+            said = ", ".join(f"{key} = {value}" for key, (value, *_) in missing.items())
             note(f"not sure: {file} lacks values of {name}: {said} from the recordings; correct them there")
         proposed += missing
     return proposed
 
 
-def _add(file: Path, name: str, entries: dict[str, tuple[float, int, str]]) -> None:
+def _rest(robot: Robot, recordings: Sequence[Recording]) -> tuple[dict[str, Entry], dict[str, Entry]]:
+    """Return set-points and outputs at the middle of the recordings, where loops and steps of a robot are tried.
+
+    What tendons bend rests at zero; so does a robot whose set-points have both signs.
+    """
+    set_points = np.concatenate([recording.set_points for recording in recordings])
+    if robot.tendon_angles is not None or (set_points.min() < 0.0 < set_points.max()):
+        return {}, {}
+    means = np.mean(set_points, axis=0), np.nanmean(np.concatenate([part.outputs for part in recordings]), axis=0)
+    if not np.isfinite(means[1]).all():
+        return {}, {}
+    units = to_si(robot.motors.unit)[0], to_si(robot.outputs.unit)[0]
+    why = "the mean of the recordings: steps of tests start there"
+    found = [[_digits(value / unit) for value in mean] for mean, unit in zip(means, units, strict=True)]
+    return {"rest": (found[0], 60, why)}, {"rest": (found[1], 60, why)}
+
+
+def _add(file: Path, name: str, entries: dict[str, Entry]) -> None:
     """Add key -> (value, certainty in %, reason) to a table of a TOML file."""
     text = file.read_text(encoding="utf-8")
     table = tomllib.loads(text)
@@ -151,7 +171,7 @@ def _add(file: Path, name: str, entries: dict[str, tuple[float, int, str]]) -> N
         temporary.write_text(text, encoding="utf-8")
 
 
-def _limits(robot: Robot, recordings: Sequence[Recording]) -> dict[str, tuple[float, int, str]]:
+def _limits(robot: Robot, recordings: Sequence[Recording]) -> dict[str, Entry]:
     """Return the range and the rate of the motors in the recordings, in the robot's unit."""
     unit = to_si(robot.motors.unit)[0]
     lowest = min(float(recording.set_points.min()) for recording in recordings) / unit
