@@ -57,6 +57,8 @@ def identify_auto(
     models: list[identification.Model] = []
     for file, taken in saved.items():
         model = _model(taken)
+        if taken is choice:
+            model = replace(model, findings={**model.findings, "chosen": choice.why})
         if tolerance is not None:
             model = identification.with_tolerance(model, tolerance)
         models.append(identification.with_fit(model, taken.chosen.judged, taken.examination))

@@ -97,17 +97,19 @@ def report(folder: Path, output: Path | None, force: bool, as_json: bool) -> Non
     controllers, certificates, FMUs, loops (run anew) and studies, with interactive plots; it opens offline. Files that
     cannot be read are listed in it.
     """
-    from softneck.report import project_page, read_project
+    from softneck.report import decision_values, project_page, read_project
 
     path, replace = target(output, "report.html", force=force, ending=".html")
     refuse_existing(path, force=replace)
     with progress("report", quiet=as_json) as tell:
         project = read_project(folder, progress=lambda done, word: tell(0.4 * done, word))
         plots.write_page(
-            path, project_page(project, progress=lambda done, word: tell(0.4 + 0.5 * done, word)), force=replace
+            path,
+            project_page(project, place=path.parent, progress=lambda done, word: tell(0.4 + 0.5 * done, word)),
+            force=replace,
         )
     if as_json:
-        print_json({"report": str(path), **_counts(project), "problems": project.problems})
+        print_json({"report": str(path), **_counts(project), "problems": project.problems, **decision_values(project)})
         return
     click.echo(f"{path}: " + ", ".join(f"{count} {name}" for name, count in _counts(project).items() if count))
     for name, problem in project.problems.items():

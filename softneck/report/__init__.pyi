@@ -11,6 +11,9 @@ from ._validation_page import validation_page as validation_page
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
 from ._decisions import auto_decision as auto_decision
+from ._decisions import certificate_values as certificate_values
+from ._decisions import model_values as model_values
+from ._decisions import project_decision as project_decision
 from ._decisions import validation_decision as validation_decision
 from ._demo import FIT_HEAD as FIT_HEAD
 from ._demo import FIT_NOTE as FIT_NOTE
@@ -19,6 +22,7 @@ from ._demo import fit_rows as fit_rows
 from ._demo import fmu_rows as fmu_rows
 from ._demo import loop_rows as loop_rows
 from ._project import Project as Project
+from ._project import decision_values as decision_values
 from ._reproduce import LINEAR_HEAD as LINEAR_HEAD
 from ._reproduce import PAPER_HEAD as PAPER_HEAD
 from ._reproduce import PAPER_NOTE as PAPER_NOTE

@@ -9,7 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from softneck.core import percent
+from softneck.core import SettingsError, percent, required_rows
+from softneck.plots import cell
+from softneck.verification import metric_title
 
 # The least simulation fits [%] with their words: `design` refuses models below 30, `identify auto` warns below 70.
 _FIT_WORDS = ((90.0, "very good"), (80.0, "good"), (70.0, "fair"), (30.0, "poor"))
@@ -105,3 +107,73 @@ def _best_on(data: str, rivals: Sequence[Values]) -> str:
 
 def _last(one: Values) -> Values:
     return list(one["fits"]["model"].values())[-1]
+
+
+def model_values(file: str, model: Any) -> dict[str, Any]:
+    """Return the JSON values of a model in a project: file, kind, and its simulation fit on the rows held out."""
+    findings = getattr(model, "findings", {})
+    fit = findings.get("hold_out", {}).get("fit", {})
+    return {"file": file, "kind": getattr(model, "kind", ""), "fit": dict(fit), "chosen": "chosen" in findings}
+
+
+def certificate_values(file: str, content: Values) -> dict[str, Any]:
+    """Return the JSON values of a certificate in a project: of which controller, and which requirements fail."""
+    rows = required_rows(content)
+    controller = content.get("files", {}).get("controller", {}).get("path", "")
+    failed = [
+        {key: row.get(key) for key in ("metric", "bound", "value", "limit", "note")}
+        for row in rows
+        if row.get("holds") is False
+    ]
+    return {"file": file, "of": str(content.get("certificate")), "controller": str(controller),
+            "kind": str(content.get("controller_kind", "")), "holds": bool(content.get("holds")) and bool(rows),
+            "requirements": len(rows), "failed": failed}  # fmt: skip
+
+
+def project_decision(models: Sequence[Values], certificates: Sequence[Values], *, tuner: str | None) -> str:
+    """Return the decision on a project: which model, which controller and what it holds, and what to do next.
+
+    `models`, `certificates`: as from `model_values` and `certificate_values`. `tuner`: path of `tuner.html`, if there.
+    """
+    said, judged = [], [one for one in models if one["fit"]]
+    if judged:
+        # That which `identify auto` chose, else the best on the rows held out.
+        best = max(judged, key=lambda one: (one["chosen"], min(map(_least, one["fit"].values()))))
+        said.append(
+            f"Use {best['file']} ({best['kind']}): on rows it has not seen it simulates {list_fits(best['fit'])}."
+        )
+    verified = sorted(
+        (one for one in certificates if one["of"] == "verify"), key=lambda one: (one["holds"], one["file"])
+    )
+    if not verified:
+        return " ".join(said)
+    one, count = verified[0], verified[0]["requirements"]
+    name, trade = (
+        f"{one['controller']} ({one['kind']})",
+        "" if tuner is None else f"open {tuner} to trade speed for caution",
+    )
+    if one["holds"]:
+        said.append(f"{name} holds all {count} requirements of {one['file']}.")
+        said.append(f"Next: run it on drives with that certificate{', or ' + trade if trade else ''}.")
+        return " ".join(said)
+    failing = "; ".join(_requirement(row) for row in one["failed"][:2])
+    more = f" and {len(one['failed']) - 2} more" if len(one["failed"]) > 2 else ""
+    said.append(f"Do not run {name} yet: {len(one['failed'])} of {count} requirements fail: {failing}{more}.")
+    said.append(
+        f"Next: loosen these, or record another motion and start with both logs{'; ' + trade if trade else ''}."
+    )
+    return " ".join(said)
+
+
+_SIGNS = {"min": "at least", "max": "at most", "below": "below"}
+
+
+def _requirement(row: Values) -> str:
+    try:
+        name = metric_title(str(row["metric"])).rpartition(" (")[0]
+    except SettingsError:  # of another version
+        name = str(row["metric"])
+    value = "not computed" if row["value"] is None else cell(row["value"], ".3g")
+    # A note says why a value within its limit does not count.
+    note = f" ({row['note']})" if row["note"] else ""
+    return f"{name} {value}, required {_SIGNS.get(row['bound'], 'at most')} {cell(row['limit'], '.3g')}{note}"

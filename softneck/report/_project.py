@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from softneck.core import (
     KINDS,
@@ -42,6 +44,7 @@ from softneck.plots import Section, Table, cell, loop_chart, page, recording_cha
 from softneck.robot import ROBOT_FILE
 from softneck.signals import Recording, assess_quality, doubts_in, import_log, read_layout, read_recording
 
+from ._decisions import certificate_values, model_values, project_decision
 from ._study_page import study_sections
 from ._validation_page import drawable
 
@@ -237,8 +240,11 @@ _HORIZONS: tuple[int | str, ...] = (1, 25, INFINITE)
 _RULES = Rules(horizons=_HORIZONS)
 
 
-def project_page(project: Project, *, progress: Progress = silent) -> str:
-    """Return the HTML page of a project: results of loops and certificates, data, models, and problems."""
+def project_page(project: Project, *, place: Path | None = None, progress: Progress = silent) -> str:
+    """Return the HTML page of a project: results of loops and certificates, data, models, and problems.
+
+    `place`: folder of the page, from which it links the other pages of the project; None: no links.
+    """
     designs = {**project.observers, **project.controllers}
     parts = (
         (project.loops, lambda: _loops(project)),
@@ -250,6 +256,8 @@ def project_page(project: Project, *, progress: Progress = silent) -> str:
         (project.fmus, lambda: _fmus(project)),
     )
     sections = [*(make() for content, make in parts if content), *_studies(project)]
+    if place is not None and sections and (links := _links(project.folder, place)):
+        sections[0] = replace(sections[0], html=links)
     if project.problems:
         rows = [[name, " ".join(text.split())[:300]] for name, text in project.problems.items()]
         table = Table("Files that could not be read or run", ["file", "why"], rows, text=2)
@@ -261,8 +269,43 @@ def project_page(project: Project, *, progress: Progress = silent) -> str:
     return page(title, sections, verdict=sentence, holds=holds, footer=footer)
 
 
+_TUNER = "tuner.html"
+
+
+def _pages(folder: Path) -> list[Path]:
+    """Return the other pages of a project, `tuner.html` first."""
+    found = [
+        path
+        for path in sorted(folder.rglob("*.html"))
+        if not any(part in _SKIPPED_FOLDERS or part.startswith(".") for part in path.relative_to(folder).parts)
+    ]
+    return sorted(found, key=lambda path: path.name != _TUNER)
+
+
+def _links(folder: Path, place: Path) -> Markup:
+    """Return a line of links to the other pages of a project."""
+    link = Markup('<a href="{}">{}</a>')
+    pages = [path for path in _pages(folder) if path.resolve() != (place / "report.html").resolve()]
+    each = [
+        link.format(Path(os.path.relpath(path, place)).as_posix(), path.relative_to(folder).as_posix())
+        for path in pages
+    ]
+    return Markup("<p>Pages: {}</p>").format(Markup(", ").join(each)) if each else Markup("")
+
+
+def decision_values(project: Project) -> dict[str, Any]:
+    """Return the JSON values from which a project's page decides, and the decision."""
+    models = [model_values(name, model) for name, model in project.models.items()]
+    certificates = [certificate_values(name, content) for name, content in project.certificates.items()]
+    pages = [path.relative_to(project.folder).as_posix() for path in _pages(project.folder)]
+    tuner = pages[0] if pages and Path(pages[0]).name == _TUNER else None
+    return {"judged_models": models, "verified": certificates, "tuner": tuner,
+            "decision": project_decision(models, certificates, tuner=tuner)}  # fmt: skip
+
+
 def project_verdict(project: Project) -> tuple[str, bool | None]:
-    """Return a sentence on limits and certificates, and whether all hold; None without any."""
+    """Return the decision, sentences on limits and certificates, and whether all hold; None without any."""
+    decision = decision_values(project)["decision"]
     loops = [result for result in project.loops.values() if result.limits]
     held = sum(result.holds for result in loops)
     certified = sum(_certifies(content) for content in project.certificates.values())
@@ -273,9 +316,11 @@ def project_verdict(project: Project) -> tuple[str, bool | None]:
         parts.append(f"{len(project.problems)} file(s) could not be read or run")
     unsure = "".join(f" Not sure of {what}: {_shorten(doubts)}." for what, doubts in _doubts(project).items())
     if not parts:
-        return f"No file of this project states a limit, so there is no verdict.{unsure}", None
-    good = held == len(loops) and certified == len(project.certificates) and not project.problems
-    return f"{'; '.join(parts)}.".capitalize() + unsure, good
+        return f"{decision} No file of this project states a limit, so there is no verdict.{unsure}".lstrip(), None
+    # A file that cannot be read stops nobody.
+    good = held == len(loops) and certified == len(project.certificates)
+    said = f"{'; '.join(parts)}."
+    return f"{decision} {said[0].upper()}{said[1:]}{unsure}".lstrip(), good if loops or project.certificates else None
 
 
 def _doubts(project: Project) -> dict[str, list[str]]:

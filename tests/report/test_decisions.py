@@ -5,17 +5,21 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from softneck.core import write_certificate
 from softneck.identification import INFINITE, Validation, validate
-from softneck.report import validation_page
+from softneck.report import decision_values, project_page, read_project, validation_page
 from softneck.report._decisions import (
     auto_decision,
     beats,
+    certificate_values,
     fit_word,
     list_fits,
+    project_decision,
     validation_decision,
 )
 
@@ -115,6 +119,62 @@ def test_auto_names_the_file_and_its_worst_test(entry: dict[str, Any]) -> None:
 
 def test_fits_without_a_linear_one_have_their_word_alone() -> None:
     assert list_fits({"x": 91.0, "y": None}) == "x 91.0 % (very good), y - % (no fit)"
+
+
+def certificate(failed: int) -> dict[str, Any]:
+    rows = [
+        {"metric": "sim.rise_s", "bound": "max", "limit": 0.4, "value": 0.4437, "holds": False},
+        {"metric": "axes.gain_margin", "bound": "min", "limit": 2.5, "value": None, "holds": False, "note": "no plant"},
+        {"metric": "sim.of_another_version", "bound": "max", "limit": 1.0, "value": 2.0, "holds": False},
+        {"metric": "axes.disk_margin", "bound": "min", "limit": 0.5, "value": 0.61, "holds": True},
+    ]
+    files = {"controller": {"path": "tune/best.npz"}}
+    return {"certificate": "verify", "holds": not failed, "requirements": rows[3 - failed :], "files": files,
+            "controller_kind": "hinf"}  # fmt: skip
+
+
+def test_a_project_decides_on_model_controller_and_next_step() -> None:
+    fit = {"x": 91.0, "y": 85.0}
+    models = [
+        {"file": "a.npz", "kind": "nn", "fit": {"x": 99.0, "y": 99.0}, "chosen": False},
+        {"file": "auto.npz", "kind": "play", "fit": fit, "chosen": True},
+        {"file": "none.npz", "kind": "oe", "fit": {}, "chosen": False},
+    ]
+    held = [certificate_values("best.certificate.json", certificate(0))]
+    said = project_decision(models, held, tuner="tune/tuner.html")
+    assert said == (
+        "Use auto.npz (play): on rows it has not seen it simulates x 91.0 % (very good), y 85.0 % (good). "
+        "tune/best.npz (hinf) holds all 1 requirements of best.certificate.json. Next: run it on drives with that "
+        "certificate, or open tune/tuner.html to trade speed for caution."
+    )
+    # The certificate that fails decides, wherever it is in the list.
+    failed = certificate_values("z.json", certificate(3))
+    for both in ([*held, failed], [failed, *held]):
+        said = project_decision(models[:1], both, tuner=None)
+        assert said == (
+            "Use a.npz (nn): on rows it has not seen it simulates x 99.0 % (very good), y 99.0 % (very good). Do not "
+            "run tune/best.npz (hinf) yet: 3 of 4 requirements fail: rise time, simulation 0.444, required at most "
+            "0.4; gain margin, worst axis not computed, required at least 2.5 (no plant) and 1 more. Next: loosen "
+            "these, or record another motion and start with both logs."
+        )
+    unknown = certificate_values("z.json", {**certificate(3), "requirements": certificate(3)["requirements"][2:3]})
+    assert "sim.of_another_version 2, required at most 1." in project_decision([], [unknown], tuner=None)
+    assert project_decision([], [], tuner=None) == ""
+
+
+def test_a_project_s_page_opens_with_the_decision_and_links_the_tuner(tmp_path: Path) -> None:
+    write_certificate(tmp_path / "c.json", certificate(2))
+    for name in ("tune/tuner.html", "build/models.html", ".hidden/a.html"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("<p>page</p>")
+    project = read_project(tmp_path)
+    values = decision_values(project)
+    assert values["tuner"] == "tune/tuner.html"
+    page = project_page(project, place=tmp_path / "build")
+    assert opening(page).startswith(values["decision"])
+    assert values["decision"].startswith("Do not run tune/best.npz (hinf) yet: 2 of 3 requirements fail: ")
+    assert [f for f in figures(values["decision"]) if not is_value(f, [2.0, 3.0, *values_of(values)])] == []
+    assert re.findall(r'<a href="([^#"]*)">', page) == ["../tune/tuner.html", "models.html"]
 
 
 @pytest.fixture(scope="module")

@@ -70,6 +70,7 @@ class Step:
         return shlex.join(self.command)
 
 
+TUNER, CERTIFICATE = "tune/tuner.html", "certificates/best.certificate.json"
 AUTO, PI, OBSERVER, BEST = "models/auto.npz", "controllers/pi.npz", "observers/kalman.npz", "tune/best.npz"
 FAMILY = "models/family.npz"
 PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU = "fmus/Plant.fmu", "fmus/Observer.fmu", "fmus/Controller.fmu"
@@ -248,14 +249,13 @@ def _controller(options: Options) -> Iterator[Step]:
     # --force continues the same search, and replaces another one. In this process: with empty caches each further
     # process compiles the same again, which takes most of the time of 80 evaluations.
     command = ("softneck", "tune", *plants, *words, "--observer", OBSERVER, "--workers", "0", "-o", "tune", "--force")
-    yield Step(stage="tune", command=command, makes=(BEST, _TUNED_LOOP, "tune/report.html"),
+    yield Step(stage="tune", command=command, makes=(BEST, _TUNED_LOOP, "tune/report.html", TUNER),
                reads=(*plants, OBSERVER, *wanted), finding=finding)  # fmt: skip
     eyes = (OBSERVER,) if uses_observer() else ()
-    certificate = "certificates/best.certificate.json"
     command = ("softneck", "verify", BEST, *plants, "--requirements", _REQUIREMENTS,
                *(word for file in eyes for word in ("--observer", file)),
-               "-o", certificate, "--html", "build/verify.html", "--force")  # fmt: skip
-    yield Step(stage="verify", command=command, makes=(certificate, "build/verify.html"),
+               "-o", CERTIFICATE, "--html", "build/verify.html", "--force")  # fmt: skip
+    yield Step(stage="verify", command=command, makes=(CERTIFICATE, "build/verify.html"),
                reads=(BEST, *plants, _REQUIREMENTS, *eyes))  # fmt: skip
     made = options.backend
     if made == "compiled":
@@ -292,5 +292,5 @@ def _loops(options: Options) -> Iterator[Step]:
                    reads=("test_closed_loop.py", "loop.toml", *_FMUS))  # fmt: skip
     command = ("softneck", "report", ".", "-o", "build/report.html", "--force")
     yield Step(stage="report", command=command, makes=("build/report.html",),
-               reads=(AUTO, BEST, "certificates/best.certificate.json", "results/loop.csv", "build/study/runs.csv",
+               reads=(AUTO, BEST, CERTIFICATE, TUNER, "results/loop.csv", "build/study/runs.csv",
                       "build/test.xml"))  # fmt: skip

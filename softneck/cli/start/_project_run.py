@@ -85,7 +85,13 @@ class ProjectRun:
         self._tell(step, kept)
         if not kept:
             begun = bool(same and entry and not entry.get("ended"))
-            self.done[step.key] = {"command": step.shown, "asked": step.depends_on, "reads": reads, "ended": False}
+            self.done[step.key] = {
+                "command": step.shown,
+                "asked": step.depends_on,
+                "reads": reads,
+                "makes": list(step.makes),
+                "ended": False,
+            }
             self.write()
             self._run(step, _words(step, begun=begun))
         said = self.done[step.key]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from softneck.core import (
 from .._import import is_terminal
 from ..shared._console import note, percent, print_json, print_table
 from ..shared._options import columns_options, common_options
-from ._plan import BEST, PI, STAGES, Options, Step, linear_model, nonlinear_model, steps
+from ._plan import BEST, CERTIFICATE, PI, STAGES, TUNER, Options, Step, linear_model, nonlinear_model, steps
 from ._possible import backend, has_pytest, require_disk
 from ._project_run import FILE, ProjectRun
 
@@ -239,17 +239,29 @@ def _facts(run: ProjectRun, folder: Path) -> dict[str, Any]:
         for key, kept in run.ran.items()
     ]
     models = {"linear": linear_model(), "nonlinear": nonlinear_model()}
+    found = {sort: _model(file) for sort, file in models.items() if file is not None}
     return {
         "folder": str(folder),
         "holds": all(row["holds"] for row in rows),
         "doubts": _doubts(),
         "failed": [row["stage"] for row in rows if not row["holds"]],
-        "models": {sort: _model(file) for sort, file in models.items() if file is not None},
+        "models": found,
         "controller": BEST,
         **_certified(),
         "report": "build/report.html",
+        "tuner": TUNER,
+        "decision": _decision(list(found.values())),
         "steps": rows,
     }
+
+
+def _decision(models: Sequence[dict[str, Any]]) -> str:
+    """Return the decision with which the project's page opens."""
+    from softneck.report import certificate_values, project_decision
+
+    found = [path for path in (Path(_CERTIFICATE_FILE), Path(CERTIFICATE)) if path.is_file()]
+    read = [certificate_values(path.as_posix(), json.loads(settings_text(path, MOST_JSON))) for path in found]
+    return project_decision(models, read, tuner=TUNER if Path(TUNER).is_file() else None)
 
 
 def _certified() -> dict[str, Any]:
@@ -285,9 +297,9 @@ def _unsure(facts: dict[str, Any]) -> str:
 
 
 def _model(file: str) -> dict[str, Any]:
+    from softneck.report import model_values
 
-    model = load(file, role="model")
-    return {"file": file, "kind": model.kind, "fit": model.findings.get("hold_out", {}).get("fit", {})}
+    return model_values(file, load(file, role="model"))
 
 
 def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
