@@ -200,6 +200,7 @@ def mimo() -> Any:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [LqgSettings(), MpcSettings(bandwidth=5.0)], ids=["lqg", "mpc"])
 def test_an_identified_model_is_taken_with_what_it_says_between_its_axes(settings: Any, mimo: Any) -> None:
     controller = settings.design(mimo.ss())

@@ -171,6 +171,7 @@ def test_a_slow_pole_that_hides_behind_a_zero_spoils_no_design(kind: str) -> Non
     assert with_it == pytest.approx(plain, rel=0.25)
 
 
+@pytest.mark.slow
 def test_a_slow_pole_that_hides_behind_a_zero_is_asked_nothing_of_by_mpc() -> None:
     """No weight on moves makes it faster: none of a bandwidth of 1 rad/s on kept any bound."""
     plain, with_it = (

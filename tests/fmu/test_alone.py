@@ -59,7 +59,8 @@ def _same(one: list[float], other: list[float]) -> bool:
     return one == pytest.approx(other, rel=1e-12, abs=1e-12)
 
 
-@pytest.mark.parametrize("first", ["softneck", pytest.param("alone", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("first", ["softneck", "alone"])
 def test_two_environments_share_a_cache_folder(first: str, files: tuple[Path, Path], tmp_path: Path) -> None:
     order = [_SOFTNECK, _ALONE] if first == "softneck" else [_ALONE, _SOFTNECK]
     (one, _), (other, said) = _run(order[0], files, tmp_path), _run(order[1], files, tmp_path)

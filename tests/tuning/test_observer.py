@@ -52,6 +52,7 @@ def test_the_observer_is_over_the_model_that_knows_payloads(task: Task) -> None:
     assert task.observer.payloads == (0.0, 1.0)
 
 
+@pytest.mark.slow
 def test_a_planner_takes_the_observers_lead_and_payload_into_its_design(task: Task) -> None:
     found, plain = controller(task, "mpc"), controller(replace(task, observer=None, digest="plain"), "mpc")
     assert found.design["settings"]["look_ahead"] == task.observer.lead > 0.0

@@ -127,6 +127,7 @@ def test_validity_of_set_membership_is_what_held_of_motions_left_out() -> None:
     assert calibrate_validity(line, line, *rows) is line
 
 
+@pytest.mark.slow
 def test_bounds_are_told_with_what_they_held_and_their_width() -> None:
     found = identify("nlsm", neck_recording(1500), form="residual")
     bounds = found.findings["examination"]["bounds"]
