@@ -36,11 +36,8 @@ def write_archive(
 
 def is_archive(path: str | Path) -> bool:
     """Return whether a file claims to be one that `write_archive` wrote: a ZIP archive with our header, or no ZIP."""
-    source = as_path(path)
-    if not source.is_file() or not zipfile.is_zipfile(source):
-        return True
     try:
-        with zipfile.ZipFile(source) as file:
+        with zipfile.ZipFile(as_path(path)) as file:
             return f"{_HEADER_KEY}.npy" in file.namelist()
     except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError):
         return True

@@ -54,8 +54,8 @@ class Certificate(ReprMixin):
 
     def failed_metrics(self) -> list[str]:
         """Return the requirements or limits that do not hold; those that were not computed (None) are left out."""
-        judged = (row for row in self.rows if row.get("holds", False) is not None)
-        return [str(row.get("metric")) for row in judged if not row.get("holds")]
+        verdicts = ((row, row.get("holds", False)) for row in self.rows)
+        return [str(row.get("metric")) for row, holds in verdicts if holds is not None and not holds]
 
 
 def required_rows(contents: Mapping[str, Any]) -> list[dict[str, Any]]:

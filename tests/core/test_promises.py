@@ -11,8 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softneck.core import CheckFailedError, FileFormatError, check_certificate, read_archive, read_certificate
-from softneck.core._archive import write_archive
+from softneck.core import (
+    CheckFailedError,
+    FileFormatError,
+    OutputFileError,
+    check_certificate,
+    read_archive,
+    read_certificate,
+)
+from softneck.core._archive import is_archive, write_archive
 from softneck.core._certificate import certificate_contents, certificate_path, write_certificate
 from softneck.core._files import MOST_UNPACKED
 
@@ -65,6 +72,65 @@ def test_archives_of_other_versions_are_refused(tmp_path: Path, version: object)
         read_archive(path)
 
 
+def told(version: int = 1, **more: Any) -> np.ndarray:
+    text = json.dumps({"format": "softneck", "format_version": version, **more}).encode()
+    return np.frombuffer(text, dtype=np.uint8)
+
+
+def test_every_member_of_an_archive_is_an_array_of_real_numbers(tmp_path: Path) -> None:
+    for name, array in (("complex", np.array([1j])), ("text", np.array(["a"])), ("date", np.array(["2026"], "M8[Y]"))):
+        np.savez(tmp_path / f"{name}.npz", header=told(), good=np.zeros(2), bad=array)
+        with pytest.raises(FileFormatError, match="its member `bad` is not an array of numbers"):
+            read_archive(tmp_path / f"{name}.npz")
+    path = tmp_path / "raw.npz"
+    np.savez(path, header=told())
+    with zipfile.ZipFile(path, "a") as file:
+        file.writestr("bad", b"1 2 3")
+    with pytest.raises(FileFormatError, match="its member `bad` is not an array of numbers"):
+        read_archive(path)
+    np.savez(path, header=told(), i=np.arange(2), u=np.arange(2, dtype="u1"), b=np.array([True]), f=np.zeros(1, "f4"))
+    assert [array.dtype.kind for array in read_archive(path)[1].values()] == ["i", "u", "b", "f"]
+
+
+@pytest.mark.parametrize(
+    ("shapes", "wrong"),
+    [({"a": [3], "b": [2]}, "`b` has shape [1] and was written with [2]"),
+     ({"a": [3, 1], "b": [1]}, "`a` has shape [3] and was written with [3, 1]"),
+     ({"a": [3]}, "`b` has shape [1] and was written with None"),
+     ({"a": [3], "b": [1], "c": []}, "`c` has shape None and was written with []"), (5, "`a` has shape [3]")],
+)  # fmt: skip
+def test_each_array_has_the_shape_that_it_was_written_with(tmp_path: Path, shapes: object, wrong: str) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, header=told(shapes=shapes), a=np.zeros(3), b=np.zeros(1))
+    with pytest.raises(FileFormatError) as caught:
+        read_archive(path)
+    assert wrong in str(caught.value)
+
+
+def test_a_header_is_read_up_to_its_greatest_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, header=told())
+    monkeypatch.setattr("softneck.core._archive.MOST_JSON", told().nbytes)
+    assert read_archive(path) == ({"format": "softneck", "format_version": 1}, {})
+    monkeypatch.setattr("softneck.core._archive.MOST_JSON", told().nbytes - 1)
+    with pytest.raises(FileFormatError, match=f"its header has {told().nbytes} bytes"):
+        read_archive(path)
+
+
+def test_only_a_zip_archive_without_our_header_is_known_to_be_none_of_ours(tmp_path: Path) -> None:
+    ours, other, damaged = (tmp_path / name for name in ("ours.npz", "other.npz", "damaged.npz"))
+    write_archive(ours, {}, {"a": np.zeros(2)})
+    np.savez(other, a=np.zeros(2))
+    damaged.write_bytes(ours.read_bytes()[:-30])
+    assert [is_archive(path) for path in (ours, other, damaged, tmp_path, tmp_path / "none")] == [
+        True, False, True, True, True,
+    ]  # fmt: skip
+    with pytest.raises(FileFormatError, match="damaged; expected a model, family, controller or observer"):
+        read_archive(damaged)
+    with pytest.raises(OutputFileError, match="exists"):
+        write_archive(ours, {}, {})
+
+
 @pytest.mark.parametrize(("size", "refused"), [(0, False), (1, True)])
 def test_two_gibibytes_are_the_most_that_an_archive_may_unpack_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int, refused: bool
@@ -109,7 +175,9 @@ def test_what_is_written_is_of_version_1_and_sealed(tmp_path: Path) -> None:
     assert contents["files"] == {"loop": {"path": "a.toml", "sha256": DIGEST}}
     assert contents["x"] == [1.5]
     write_certificate(tmp_path / "c.json", contents)
-    assert json.loads((tmp_path / "c.json").read_text(encoding="utf-8")) == contents
+    text = (tmp_path / "c.json").read_text(encoding="utf-8")
+    assert json.loads(text) == contents
+    assert text.startswith('{\n  "certificate": "simulate",\n')
     with pytest.raises(ValueError, match="JSON compliant"):
         write_certificate(tmp_path / "d.json", {"x": float("nan")})
 
@@ -168,6 +236,16 @@ def test_the_rows_that_failed_are_named_in_their_order(tmp_path: Path) -> None:
         path = tmp_path / f"{key}.json"
         path.write_text(sealed({**changed, key: rows}), encoding="utf-8")
         assert read_certificate(path).failed_metrics() == ["b", "c"]
+
+
+def test_metrics_of_earlier_versions_have_their_names_of_today(tmp_path: Path) -> None:
+    rows = [{"metric": name, "holds": True} for name in ("neck.slack_s", "neck", "necks.a", "a.neck.b", 5)]
+    path = tmp_path / "c.json"
+    path.write_text(sealed(certificate(requirements=[*rows, {"holds": True}])), encoding="utf-8")
+    found = read_certificate(path).rows
+    assert [row.get("metric") for row in found] == ["sim.slack_s", "sim", "necks.a", "a.neck.b", 5, None]
+    with pytest.raises(FileFormatError, match="no such certificate"):
+        read_certificate(tmp_path / "none.json")
 
 
 def test_a_certificate_lies_beside_its_controller_or_where_verify_writes(tmp_path: Path, controller: Path) -> None:
