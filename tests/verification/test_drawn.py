@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from softneck.cli._verify import _attempt_of, _tried
-from softneck.core import certificate_contents, write_certificate
+from softneck.core import DataError, certificate_contents, write_certificate
 from softneck.identification import Draws, Family
 from softneck.identification.uncertainty import _draws
-from softneck.verification import make_requirements, verify
-from softneck.verification._drawn import certified_content
+from softneck.loop import LoopResult
+from softneck.verification import _drawn, make_requirements, verify
+from softneck.verification._drawn import Drawn, _Margin, certified_content, draws_of, run_drawn
 from softneck.verification._experiments import crossing_values, crossings
 from softneck.verification._neck_loops import loops_under_test, make_simulation_model
 
-from .necks import COUNT, QUICK, family, pi, small_draws
+from .necks import COUNT, QUICK, TS, family, pi, small_draws
 
 ASKED = {**QUICK, "sim": {**QUICK["sim"], "size_deg": 10.0}}
 
@@ -121,3 +125,344 @@ def test_attempts_over_a_family_are_counted_from_the_certificates_of_a_folder(tm
     assert attempt("d" * 64, "f" * 64, "two")[0] == 4
     (tmp_path / "note.json").write_text("{}", encoding="utf-8")
     assert attempt("d" * 64, "f" * 64, "two")[0] == 4
+
+
+# -- how draws are run and judged, without a loop ---------------------------------------------------------------------
+
+
+def told_draws(**more: Any) -> Any:
+    conditions = {"motion": [0.1, 0.4], "payload_kg": [0.0, 0.5], **more}
+    return SimpleNamespace(seed=7, model=SimpleNamespace(kind="play"), coverage=[1], level=0.9, conditions=conditions,
+                           share=np.array([0.01, 0.02]), keep=0.9)  # fmt: skip
+
+
+def test_draws_say_how_many_hold_at_which_attempt() -> None:
+    def drawn(failed: tuple[int, ...] = (), attempt: int = 1) -> Drawn:
+        return Drawn("f", told_draws(), attempt, 59, {}, {}, failed)
+
+    assert drawn().content == pytest.approx(0.05 ** (1 / 59), rel=1e-12)
+    assert drawn(attempt=3).content == pytest.approx((0.05 / 3) ** (1 / 59), rel=1e-12)
+    assert drawn().statement() == ("none of 59 draws of f fails: 95.0 % of such plants hold, with 95 % confidence")
+    assert drawn(attempt=2).statement().endswith("(attempt 2, which is counted)")
+    bad = drawn((1, 4))
+    assert (bad.content, bad.statement()) == (0.0, "2 of 59 draws of f fail")
+    assert bad.facts() == {
+        "family": "f", "count": 59, "failed": [1, 4], "attempt": 1, "content": 0.0, "confidence": 0.95, "seed": 7,
+        "kind": "play", "coverage": [1], "level": 0.9, "statement": "2 of 59 draws of f fail",
+    }  # fmt: skip
+    with_, without = SimpleNamespace(draws=5), SimpleNamespace(draws=None)
+    assert draws_of({"a": without, "b": with_, "c": object()}) == {"b": 5}
+
+
+def test_the_margin_of_a_draw_is_the_strictest_that_is_required() -> None:
+    def required(**require: Any) -> dict[str, float]:
+        free = {"axes.gain_margin": False, "axes.delay_margin_ms": False}
+        return _drawn._required_margins(make_requirements({"require": free | require}))
+
+    assert required() == {}
+    assert required(**{"axes.gain_margin": {"min": 2.0, "max": 9.0}}) == {"axes.gain_margin": 2.0}
+    assert required(**{"axes.gain_margin": {"max": 9.0}, "axes.delay_margin_ms": {"min": 40.0}}) == {
+        "axes.delay_margin_ms": 40.0
+    }
+
+
+@pytest.mark.parametrize(
+    ("motion", "steps"),
+    [([0.1, 0.4], (0.02, math.sqrt(0.002), 0.1)), ([0.4, 0.1], (0.02, math.sqrt(0.002), 0.1)), ([0.01, 0.4], (0.01,)),
+     ([1.0, 2.0], (0.02, math.sqrt(0.006), 0.3))],
+)  # fmt: skip
+def test_steps_of_margins_lie_within_the_recorded_motion(
+    motion: list[float], steps: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_drawn, "_under_test", lambda *_: SimpleNamespace(kicks=(0.02, 0.3)))
+    found = _drawn._amplitudes(told_draws(motion=motion), make_requirements({}))
+    assert found == pytest.approx(steps, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "motion", "heavy", "told"),
+    [
+        ({"size_deg": 11.0}, 10.0, 0.5, ""), ({"size_deg": 11.01}, 10.0, 0.5, "steps of 11 deg, the recordings move"),
+        ({"payloads_kg": [0.0, 0.5]}, 45.0, 0.5, ""), ({}, 45.0, 0.0, ""),
+        ({"payloads_kg": [0.6, 0.0]}, 45.0, 0.5, "a payload of 0.6 kg, recorded up to 0.5 kg"),
+    ],
+)  # fmt: skip
+def test_conditions_beyond_the_recordings_are_told(
+    changes: dict[str, Any], motion: float, heavy: float, told: str
+) -> None:
+    draws = told_draws(motion=[math.radians(45.0), math.radians(motion)], payload_kg=[heavy, 0.0])
+    found = _drawn._unreached(draws, make_requirements({"sim": changes}))
+    assert set(found) == ({"sim"} if told else set())
+    assert told in found.get("sim", "")
+
+
+def test_a_draw_carries_the_lightest_and_the_heaviest_payload() -> None:
+    def payloads(*known: float) -> tuple[float, ...]:
+        plant: Any = SimpleNamespace(payloads=lambda _: list(known))
+        return _drawn._payloads(plant, make_requirements({}))
+
+    assert payloads(0.3, 0.0, 1.0) == (0.0, 1.0)
+    assert payloads(0.5) == (0.5,)
+
+
+def result_of(**signals: Any) -> LoopResult:
+    columns = {name: np.array(values, float) for name, values in signals.items()}
+    return LoopResult(np.arange(len(next(iter(columns.values())))) * TS, columns, {}, TS)
+
+
+def test_the_error_under_the_load_is_the_worse_output_s_from_the_load_on() -> None:
+    asked = make_requirements({})
+    for pitch, roll in (([9.0, 9.0, 0.1, 0.3], [9.0, 9.0, 0.5, 0.7]), ([0.0, 9.0, 0.5, 0.7], [0.0, 0.0, 0.1, 0.3])):
+        result = result_of(pitch=pitch, roll=roll, pitch_reference=[0.0] * 4, roll_reference=[0.0] * 4)
+        # rms of 0.5 and 0.7; sums are rounded.
+        assert _drawn._load_rms(result, 2, asked) == pytest.approx(math.degrees(math.sqrt(0.37)), rel=1e-12)
+    lost = result_of(pitch=[0.0, math.nan], roll=[0.0, 0.0], pitch_reference=[0.0] * 2, roll_reference=[0.0] * 2)
+    assert math.isnan(_drawn._load_rms(lost, 1, asked))
+
+
+def test_outputs_of_a_draw_are_those_that_its_sensor_tells() -> None:
+    told = result_of(pitch=[0.0, 1.0, 2.0], roll=[0.0, 0.0, 0.0], pitch_measured_seen=[5.0, 6.0, 7.0],
+                     roll_measured_seen=[1.0, 2.0, 3.0])  # fmt: skip
+    found = _drawn._with_disturbance(told)
+    assert (found["pitch"].tolist(), found["roll"].tolist()) == ([5.0, 6.0, 7.0], [1.0, 2.0, 3.0])
+    rows = _drawn._rows(found, 1, 3)
+    assert (rows.time.tolist(), rows["roll"].tolist()) == ([TS, 2 * TS], [2.0, 3.0])
+
+
+@pytest.mark.parametrize("angle", [0.0, 90.0])
+@pytest.mark.parametrize("load", [0.0, -0.05])
+@pytest.mark.parametrize("diverges", [False, True])
+def test_a_step_of_a_draw_has_its_disturbance_and_then_its_load(
+    angle: float, load: float, diverges: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = make_requirements(
+        {"step": {"load_rad": load, "noise_deg": 0.2}, "sim": {"size_deg": 10.0, "duration_s": 2.5}}
+    )
+    loops = []
+
+    def run(loop: Any, *, compiled: bool) -> LoopResult:
+        loops.append(loop)
+        if diverges:
+            raise DataError("overflow")
+        rows = round(loop.duration / TS)
+        signals = {f"motor_setpoint_{j}": np.zeros(rows) for j in (1, 2, 3)}
+        for name, size in zip(("pitch", "roll"), loop.reference.values, strict=True):
+            signals[f"{name}_reference"] = np.where(np.arange(rows) * TS >= loop.reference.at, size, 0.0)
+            signals[name] = np.full(rows, 9.0)
+            signals[f"louder.{name}_measured_seen"] = signals[f"{name}_reference"] + 0.01 * (np.arange(rows) >= 150)
+        return LoopResult(np.arange(rows) * TS, signals, {}, TS)
+
+    monkeypatch.setattr(_drawn, "run_loop", run)
+    monkeypatch.setattr(_drawn, "Loop", lambda **settings: SimpleNamespace(**settings))
+    motors = np.array([[1.0, 0.0], [0.5, -1.0], [0.0, 2.0]])
+    task: Any = SimpleNamespace(
+        asked=asked, draws=told_draws(), controller=pi().block(), observer=None, order="parallel", motors=motors
+    )
+    plant: Any = SimpleNamespace(quiet=lambda ts: ("quiet", ts), carrying=lambda kg: {"plant_inputs": {"payload": kg}})
+    found = _drawn._step(task, plant, 4, 0.3, math.radians(angle))
+    [loop] = loops
+    assert loop.plant == ("quiet", TS)
+    assert (loop.plant_inputs, loop.order) == ({"payload": 0.3}, "parallel")
+    size = math.radians(10.0)
+    assert loop.reference.values == pytest.approx((size, 0.0) if angle == 0.0 else (0.0, size), abs=1e-12)
+    assert (loop.reference.at, loop.duration) == (0.5, 0.5 + 2.5 * (2 if load else 1))
+    louder = loop.other_parameters["louder"]
+    assert {key: louder[key] for key in ("share_pitch", "share_roll", "keep", "noise_seed")} == {
+        "share_pitch": 0.01, "share_roll": 0.02, "keep": 0.9, "noise_seed": 4.0,
+    }  # fmt: skip
+    assert louder["noise"] == pytest.approx(math.radians(0.2), rel=1e-12)
+    # A load on the stepped axis, spread over the motors that move it, when the step has had its time.
+    column = motors[:, 0 if angle == 0.0 else 1]
+    expected = [(j + 1, load * share, 3.0) for j, share in enumerate(column) if share and load]
+    assert [(fault.motor, fault.size, fault.start) for fault in loop.faults] == expected
+    assert ("sim.load_rms_deg" in found) is bool(load)
+    if diverges:
+        assert all(value == math.inf for value in found.values())
+        return
+    # The error of 0.01 rad begins with the load, after row 150: the step alone has none.
+    assert (found["sim.rise_s"], found["sim.steady_rms_deg"]) == (0.0, pytest.approx(0.0, abs=1e-12))
+    if load:
+        assert found["sim.load_rms_deg"] == pytest.approx(math.degrees(0.01), rel=1e-9)
+    # The plant tells no tensions, so nothing is said of slack.
+    assert "sim.slack_s" not in found
+
+
+@pytest.mark.parametrize(
+    ("payload", "outputs", "names"),
+    [("inputs", 2, ["0 kg, 0 deg", "0 kg, 45 deg", "0.5 kg, 0 deg", "0.5 kg, 45 deg"]), ("", 2, ["0 deg", "45 deg"]),
+     ("inputs", 1, ["0 kg", "0.5 kg"])],
+)  # fmt: skip
+def test_every_payload_and_direction_of_a_draw_is_run_and_named(
+    payload: str, outputs: int, names: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_drawn, "_step", lambda *args: {"m": args[3] + math.degrees(args[4])})
+    robot = SimpleNamespace(outputs=SimpleNamespace(names=("pitch", "roll")[:outputs]))
+    asked = SimpleNamespace(robot=robot, sim={"payloads_kg": [0.0, 0.5], "orientations_deg": [0.0, 45.0]})
+    plant = SimpleNamespace(payload=payload, payloads=lambda asked: asked if payload else [0.0])
+    task: Any = SimpleNamespace(asked=asked, plants=[None, plant])
+    found = _drawn._steps(task, 1)["m"]
+    assert [name for _, name in found] == names
+    angles = [0.0, 45.0] if outputs > 1 else [0.0]
+    expected = [kg + angle for kg in ([0.0, 0.5] if payload else [0.0]) for angle in angles]
+    assert [value for value, _ in found] == pytest.approx(expected)
+
+
+@dataclass(frozen=True)
+class Case:
+    """An experiment that oscillates from `ends` on, by twice what is raised; `rests`: whether it is calm at gain 1."""
+
+    what: str
+    ends: float = math.inf
+    rests: bool = True
+    amplitude: float = 0.5
+    sample_time: float = TS
+    axes: str = "pitch"
+    posture: tuple[float, ...] = (0.1, 0.0)
+    loop: Any = field(default_factory=lambda: SimpleNamespace(samples=2))
+    tried: list[tuple[float, float]] = field(default_factory=list)
+
+    def comes_to_rest(self, floor: float) -> bool:
+        return self.rests and floor == 0.25
+
+    def try_at(self, value: float, floor: float) -> tuple[bool, float]:
+        self.tried.append((value, floor))
+        return value >= self.ends, 2.0 * value
+
+    def oscillates(self, value: float, floor: float) -> bool:
+        return self.try_at(value, floor)[0]
+
+
+def margin(case: Case, limit: float, oscillates: bool = False, **more: Any) -> _Margin:
+    return _Margin(0, "m", case, 0.25, limit, 0.0, oscillates, **more)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("kind", ["gain_up", "delay"])
+@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("ranks", [True, False])
+def test_a_draw_is_tried_at_its_required_margin_and_ranked_beyond(kind: str, whole: bool, ranks: bool) -> None:
+    delay = kind == "delay"
+    metric, limit, value = ("axes.delay_margin_ms", 40.0, 0.04) if delay else ("axes.gain_margin", 2.0, 2.0)
+
+    def at_limit(case: Case) -> list[_Margin]:
+        return _drawn._at_limit(case, 0.25, metric, limit, 3, whole=whole, ranks=ranks)  # pyright: ignore[reportArgumentType]
+
+    found = at_limit(Case("", ends=value))
+    assert [item.experiment.what for item in found] == (
+        ["delay"] if delay else ["gain_up", "gain_down"] if whole else ["gain_up"]
+    )
+    for item in found:
+        assert (item.number, item.metric, item.floor, item.limit, item.oscillates) == (3, metric, 0.25, limit, True)
+        # Over the step of 0.5: twice what is raised, at the margin, and at twice the margin.
+        assert item.swing == pytest.approx(4.0 * value)
+        assert item.beyond == pytest.approx(8.0 * value if ranks else 0.0)
+    assert not any(item.oscillates for item in at_limit(Case("", ends=1.001 * value)))
+    for item in at_limit(Case("", rests=False)):
+        assert (item.oscillates, item.swing) == (True, math.inf)
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit", "ends", "least", "value"),
+    [
+        # Gains are scanned by quarters of an octave, delays in samples of the neck's; both beyond the limit alone.
+        ("gain_up", 2.0, 3.0, math.inf, 3.0), ("gain_up", 2.0, 99.0, math.inf, math.inf),
+        ("gain_up", 2.0, 3.0, 3.5, 3.0), ("gain_up", 2.0, 3.6, 3.5, math.inf),
+        ("delay", 40.0, 0.2, math.inf, 0.2), ("delay", 40.0, 0.2, 0.15, math.inf), ("delay", 40.0, 0.2, 0.3, 0.2),
+    ],
+)  # fmt: skip
+def test_a_margin_beyond_the_required_one_is_scanned_and_bisected(
+    kind: str, limit: float, ends: float, least: float, value: float
+) -> None:
+    case = Case(kind, ends=ends)
+    # Bisected to half a percent.
+    assert _drawn._margin(margin(case, limit), least) == pytest.approx(value, rel=0.006)
+    floor = limit / 1e3 if kind == "delay" else limit
+    assert all(floor < tried and at == 0.25 for tried, at in case.tried)
+    if math.isinf(least) and math.isinf(value):
+        assert max(tried for tried, _ in case.tried) == 16.0
+
+
+def test_a_margin_below_the_required_one_is_bisected_from_none() -> None:
+    # To half a percent, or a fiftieth of a sample.
+    for kind, limit, ends, none in (
+        ("gain_up", 2.0, 1.5, 1.0),
+        ("gain_down", 2.0, 1.5, 1.0),
+        ("delay", 40.0, 0.03, 0.0),
+    ):
+        found = _drawn._margin(margin(Case(kind, ends=ends), limit, True), math.inf)
+        assert found == pytest.approx(ends, rel=0.006, abs=0.02 * TS)
+        assert _drawn._margin(margin(Case(kind, ends=ends, rests=False), limit, True), math.inf) == none
+
+
+def test_the_least_margin_of_a_draw_is_that_of_its_worst_experiment_in_its_unit() -> None:
+    for order in (1, -1):
+        far, near = margin(Case("gain_up", ends=5.0), 2.0, beyond=3.0), margin(Case("gain_up", ends=3.0), 2.0)
+        value, item = _drawn._least_margin([far, near][::order])
+        assert (value, item) == (pytest.approx(3.0, rel=0.006), near)
+    value, _ = _drawn._least_margin([margin(Case("delay", ends=0.2), 40.0)])
+    assert value == pytest.approx(200.0, rel=0.006)
+    value, item = _drawn._least_margin([far, margin(Case("gain_up"), 2.0)])
+    assert (value, item) == (pytest.approx(5.0, rel=0.006), far)
+    assert _drawn._least_margin([margin(Case("gain_up"), 2.0)])[0] == math.inf
+    facts = _drawn._margin_facts(far, "draw 1", make_requirements({}))
+    assert facts["kick_deg"] == pytest.approx(math.degrees(0.5))
+    assert facts["posture_deg"] == pytest.approx([math.degrees(0.1), 0.0])
+    assert (facts["name"], facts["axis"], facts["raised"], facts["worst_of"]) == ("draw 1", "pitch", "gain_up", 3)
+
+
+def test_draws_that_fail_are_bisected_first_and_then_those_that_swing_most() -> None:
+    bad, loud, calm = margin(Case(""), 2.0, True), margin(Case(""), 2.0, beyond=4.0), margin(Case(""), 2.0, beyond=1.0)
+    ranked = sorted([[calm], [calm, loud], [calm, bad], [calm, calm]], key=_drawn._severity)
+    assert ranked[:2] == [[calm, bad], [calm, loud]]
+
+
+def run_with(
+    monkeypatch: pytest.MonkeyPatch, steps: list[dict[str, float]], margins: list[list[_Margin]], **more: Any
+) -> tuple[Drawn, list[float]]:
+    """Run draws that have these values and margins, the more oscillating margins the less of it."""
+    monkeypatch.setattr(_drawn, "make_simulation_model", lambda _, name, __: SimpleNamespace(name=name))
+    monkeypatch.setattr(_drawn, "_steps", lambda _, k: {key: [(v, "0 deg")] for key, v in steps[k].items()})
+    monkeypatch.setattr(_drawn, "_margins", lambda _, k: margins[k])
+    monkeypatch.setattr(_drawn, "_least_margin", lambda items: (items[0].limit, items[0]))
+    monkeypatch.setattr(_drawn, "_amplitudes", lambda *_: (0.1,))
+    monkeypatch.setattr(_drawn, "directions_of", lambda _: None)
+    draws, told = told_draws(), list[float]()
+    draws.for_certificate = lambda attempt: [attempt] * len(steps)
+    draws.for_search = lambda count=9: [0] * min(count, len(steps))
+    asked = make_requirements({"sim": {"decides": True}, "require": {"sim.overshoot_pct": {"max": 10.0}}})
+    found = run_drawn("f", draws, pi().block(), asked, order="sequential", observer=None, attempt=2,
+                      progress=lambda share, _: told.append(share), **more)  # fmt: skip
+    return found, told
+
+
+@pytest.mark.parametrize("bad", [None, 0, 1, 2])
+@pytest.mark.parametrize("lost", [10.001, math.nan, math.inf])
+def test_a_draw_fails_by_its_steps_and_by_its_margins(
+    bad: int | None, lost: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = [{"sim.overshoot_pct": 10.0 - k} for k in range(3)]
+    if bad is not None:
+        steps[bad]["sim.overshoot_pct"] = lost
+    found, told = run_with(monkeypatch, steps, [[], [], []])
+    assert found.failed == (() if bad is None else (bad,))
+    assert (found.count, found.attempt) == (3, 2)
+    np.testing.assert_array_equal(found.values["sim.overshoot_pct"], [s["sim.overshoot_pct"] for s in steps])
+    names = [item["name"] for item in found.conditions["sim.overshoot_pct"]]
+    assert names == [f"draw {k + 1} of f, 0 deg" for k in range(3)]
+    assert told == sorted(told)
+    margins = [[replace(margin(Case("gain_up"), 2.0, k == bad), number=k)] for k in range(3)]
+    assert run_with(monkeypatch, [{}] * 3, margins)[0].failed == (() if bad is None else (bad,))
+
+
+def test_each_kind_of_margin_is_bisected_on_the_draws_that_swing_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    def of(k: int, kind: str) -> _Margin:
+        return replace(margin(Case(kind), 10.0 * k, beyond=float(k)), number=k, metric="axes.gain_margin")
+
+    margins = [[of(k, "gain_up"), of(4 - k, "gain_down")] for k in range(5)]
+    margins = [[replace(item, number=k) for item in row] for k, row in enumerate(margins)]
+    found, _ = run_with(monkeypatch, [{}] * 5, margins)
+    assert found.values["axes.gain_margin"].tolist() == [40.0, 30.0, 20.0, 40.0, 30.0, 20.0]
+    facts = found.conditions["axes.gain_margin"]
+    assert [item["name"] for item in facts] == [f"draw {k} of f" for k in (5, 4, 3, 1, 2, 3)]
+    assert [item["raised"] for item in facts] == ["gain_up"] * 3 + ["gain_down"] * 3
+    # A search sees draws of its own, and no more than it asks for.
+    assert run_with(monkeypatch, [{}] * 5, [[]] * 5, search=True, count=2)[0].count == 2
