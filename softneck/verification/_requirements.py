@@ -91,11 +91,13 @@ def expand_metrics(table: Mapping[str, Any], robot: Robot, *, stepping: bool, tr
     known = metric_names(robot, track=track)
     nested: dict[str, Any] = {key: value for key, value in table.items() if key in _TABLE_NAMES}
     for key, value in table.items():
+        if key in _TABLE_NAMES:
+            continue
         full = [key, *(f"{group}.{key}" for group in (*order, "axes", "robust", "mimo", "stability"))]
         metric = next((name for name in full if name in known), None)
         if metric is None:
-            if isinstance(value, Mapping) or key in _TABLE_NAMES:
-                nested[key] = value  # a table; unknown ones are refused below
+            if isinstance(value, Mapping):
+                nested[key] = value  # an unknown table, which is refused below
                 continue
             ends = sorted({name.partition(".")[2] for name in known})
             hint = did_you_mean(str(key), ends)

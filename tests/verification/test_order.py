@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +14,17 @@ import pytest
 from softneck.core import DataError, metric_of
 from softneck.loop import LoopResult
 from softneck.robot import Robot
-from softneck.verification import _evidence, _experiments, _linear, _neck_loops, _steps, _structured, metric_names
+from softneck.verification import (
+    Verification,
+    _evidence,
+    _experiments,
+    _linear,
+    _neck_loops,
+    _steps,
+    _structured,
+    _verify,
+    metric_names,
+)
 from softneck.verification._evidence import Evidence, Values, worst_row
 from softneck.verification._experiments import Crossing, crossing_values
 from softneck.verification._linear import LARGE, SMALL, LinearLaw, margins
@@ -23,7 +34,7 @@ from softneck.verification._plants import nominal_plants, source_of_family
 from softneck.verification._requirements import Requirement, make_requirements
 from softneck.verification._steps import StepTest, _metrics, run_steps
 from softneck.verification._structured import StructuredResult, _Task
-from softneck.verification._verify import _verdict
+from softneck.verification._verify import Verdict, _verdict
 
 from ..order import check_worst, is_worse
 from .necks import TS, family, pi
@@ -71,6 +82,121 @@ def test_a_verdict_is_that_of_the_worst_and_no_number_holds_nothing(name: str) -
         assert verdict(values, math.nan).holds is False
         assert verdict([*values, math.nan], worse).holds is False
         assert verdict([math.nan, *values], worse).holds is False
+
+
+@pytest.mark.parametrize("asked", [True, False])
+@pytest.mark.parametrize(
+    ("name", "drawn", "foreign", "value", "holds", "note"),
+    [
+        # Without draws each decides; a built-in plant decides where it is asked.
+        ("axes.sensitivity", None, False, 9.0, (False, False), ""),
+        ("axes.sensitivity", None, False, 1.0, (True, True), ""), ("sim.rise_s", None, False, 9.0, (False, False), ""),
+        ("sim.rise_s", None, True, 9.0, (False, None), "built-in"),
+        ("sim.rise_s", None, True, 1.0, (True, None), "built-in"), ("step.rise_s", None, True, 9.0, (False, False), ""),
+        # With draws: what they tell decides, a linear test that fails is shown beside, and one that is asked counts.
+        ("axes.gain_margin", "axes.gain_margin", False, 1.0, (False, False), ""),
+        ("axes.sensitivity", "axes.gain_margin", False, 9.0, (False, None), "draws of the family decide"),
+        ("axes.sensitivity", "axes.gain_margin", False, 1.0, (True, True), ""),
+        ("sim.rise_s", "axes.gain_margin", False, 9.0, (False, False), ""),
+        # What was not computed: of simulated loops, or beside draws, it is open where nobody asked; else it fails.
+        ("step.rise_s", None, False, None, (False, False), "not computed"),
+        ("sim.rise_s", None, False, None, (False, None), "not computed"),
+        ("robust.mu", "axes.gain_margin", False, None, (False, None), "not computed"),
+    ],
+)  # fmt: skip
+def test_who_decides(
+    name: str, drawn: str | None, foreign: bool, value: float | None, holds: tuple[Any, Any], note: str, asked: bool
+) -> None:
+    table = {} if value is None else {name: Values(np.array([value]), lambda _: {})}
+    part = SimpleNamespace(values={drawn: [1.0]}, unreached={})
+    evidence: Any = SimpleNamespace(
+        metrics=table, not_computed={}, foreign=foreign, tested=[], drawn=[part] if drawn else [], crossings=[],
+        plants=SimpleNamespace(axes=("pitch", "roll")),
+    )  # fmt: skip
+    found = _verdict(Requirement(name, _bound(name), 1.5, asked), evidence, {})
+    assert (found.holds, found.value) == (holds[0 if asked else 1], value)
+    assert (note in found.note) if note and not (asked and note != "not computed") else found.note == ""
+
+
+@pytest.mark.parametrize(
+    ("metric", "why"),
+    [("sim.rise_s", ["no such payload"]), ("axes.gain_margin", ["pitch"]), ("step.rise_s", ["loop"]),
+     ("pitch.sensitivity", ["pitch"]), ("roll.sensitivity", ["loop"]), ("roll.delay_margin_ms", ["alone"]),
+     ("robust.mu", ["pitch"]), ("track.circle_rms_deg", [""])],
+)  # fmt: skip
+def test_the_data_that_a_metric_is_about_must_support_it(metric: str, why: list[str]) -> None:
+    def reason(tested: bool, *, foreign: bool = False, drawn: Any = (), said: Any = None) -> str:
+        told = [SimpleNamespace(axis=axis, why=lambda axis=axis: "" if axis == "roll" else axis, unheard=())
+                for axis in ("roll", "pitch")]  # fmt: skip
+        evidence: Any = SimpleNamespace(tested=told * tested, foreign=foreign, drawn=list(drawn),
+                                        plants=SimpleNamespace(axes=("pitch", "roll")))  # fmt: skip
+        elsewhere = {"sim": "no such payload", "margins": "alone", "loop": "loop"} if said is None else said
+        return _verify.unsupported_reason(Requirement(metric, "max", 1.0, True), evidence, elsewhere)
+
+    assert reason(True) == why[0]
+    assert reason(True, said={}) == (why[0] if why[0] == "pitch" else "")
+    assert reason(False, said={}) == ""
+    if metric.startswith("sim."):
+        assert reason(True, foreign=True) == ""
+        large: Any = SimpleNamespace(values={}, unreached={"sim": "too large"})
+        assert reason(True, drawn=[large]) == "too large"
+    # What draws tell is about their loops, of which the co-contraction alone may be another.
+    decided = SimpleNamespace(values={metric: [1.0]}, unreached={})
+    if not metric.startswith("sim."):
+        assert reason(True, drawn=[decided]) == "loop"
+
+
+@pytest.mark.parametrize("holds", [[True, None], [True, False], [False, True], [None], [True, True]])
+def test_a_verification_holds_where_none_fails_and_counts_what_is_not_computed(holds: list[Any]) -> None:
+    item = Requirement("axes.sensitivity", "max", 2.0, True)
+    verdicts = [Verdict(item, None if value is None else 1.5, value, {"row": k}, "open" * (value is None))
+                for k, value in enumerate(holds)]  # fmt: skip
+    evidence: Any = SimpleNamespace(drawn=[], plants=[0] * 7, necks=[], not_computed={"sim": "none"}, foreign=True,
+                                    tested=[], crossings=[], linear=[])  # fmt: skip
+    under: Any = SimpleNamespace(extra=2, order="parallel", robot=Robot.preset(),
+                                 block=SimpleNamespace(sample_time=TS, kind="pi"))  # fmt: skip
+    files = {"controller": ("pi.npz", "a" * 64)}
+    found = Verification(verdicts=verdicts, evidence=evidence, controller=under, necks=[], files=files,
+                         requirements=make_requirements({}))  # fmt: skip
+    assert found.holds is (False not in holds)
+    assert [verdict.worst["row"] for verdict in found.failed] == [k for k, value in enumerate(holds) if value is False]
+    assert found.summary().startswith("all" if all(holds) else f"{holds.count(True)} of {len(holds)} requirements hold")
+    assert (", 1 is not computed" in found.summary()) is (None in holds)
+    assert "parallel order: 2 samples of delay" in found.order_words()
+    said = found.contents({0: Path("worst.toml")})
+    assert said["holds"] is found.holds
+    assert [row["holds"] for row in said["requirements"]] == holds
+    assert [row.get("note") for row in said["requirements"]] == [None if v is not None else "open" for v in holds]
+    assert [row.get("loop") for row in said["requirements"]] == ["worst.toml", *[None] * (len(holds) - 1)]
+    assert (said["plants"]["count"], said["extra_delay_samples"], said["not_computed"]) == (7, 2, {"sim": "none"})
+    assert said["files"] == {"controller": {"path": "pi.npz", "sha256": "a" * 64}}
+    assert "attempts" not in said
+    assert found.contents(attempts={"tried": []})["attempts"] == {"tried": []}
+
+
+def test_the_validity_of_a_certificate_is_the_narrowest_of_its_families_and_the_least_of_its_margins() -> None:
+    tested: Any = [SimpleNamespace(band=(1.0, 30.0), margins={"gain_margin": 2.5, "delay_margin_ms": 90.0}),
+                   SimpleNamespace(band=(2.0, 20.0), margins={"gain_margin": 3.5})]  # fmt: skip
+    part = SimpleNamespace(plants=SimpleNamespace(axes=("pitch", "roll")), margins={
+        "pitch.gain_margin": np.array([4.0, 3.0]), "roll.gain_margin": np.array([2.2, 5.0]),
+        "pitch.delay_margin_ms": np.array([80.0]), "roll.delay_margin_ms": np.array([100.0])})  # fmt: skip
+    found = [
+        Crossing("p", axes, what, 0.1, (0.0, 0.0), value, 0.0)
+        for axes, what, value in (("both", "gain_down", 1.9), ("roll", "delay", 0.07), ("pitch", "gain_up", 2.9))
+    ]
+    facts = {"amplitude": [0.0, 0.3, 0.1], "confidence": 0.95, "names": ["a.csv"], "sha256": ["b"]}
+    more = {**facts, "amplitude": [0.7], "confidence": 0.9}
+    evidence: Any = SimpleNamespace(tested=tested, crossings=found, linear=[part])
+    said = _verify.validity(evidence, {"f": facts, "g": more})
+    assert (said["band_rad_s"], said["amplitude_rad"], said["confidence_level"]) == ([2.0, 20.0], [0.1, 0.7], 0.9)
+    assert said["margins"] == {
+        "linear": {"gain_ratio": 2.2, "delay_s": 0.08},
+        "simulated": {"gain_ratio": 1.9, "delay_s": 0.07},
+    }
+    assert said["recordings"][0] == {"family": "f", "name": "a.csv", "sha256": "b"}
+    none = _verify.validity(SimpleNamespace(tested=[], crossings=[], linear=[]), {})  # pyright: ignore[reportArgumentType]
+    assert none["margins"] == {kind: {"gain_ratio": None, "delay_s": None} for kind in ("linear", "simulated")}
+    assert (none["band_rad_s"], none["amplitude_rad"], none["confidence_level"]) == (None, None, None)
 
 
 # -- steps ------------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from softneck.core import DataError, SettingsError
 from softneck.core._certificate import required_rows
 from softneck.loop import LoopResult, metrics
 from softneck.robot import Robot
-from softneck.verification import make_requirements, metric_names, metric_title
+from softneck.verification import Scale, make_requirements, metric_names, metric_title, read_requirements
 from softneck.verification._linear import LinearLaw, frequency_grid
 from softneck.verification._plants import (
     all_plants,
@@ -24,7 +24,7 @@ from softneck.verification._plants import (
     source_of_family,
     source_of_model,
 )
-from softneck.verification._requirements import Requirement
+from softneck.verification._requirements import Requirement, apply_safety_margin, expand_metrics, select_for_verify
 from softneck.verification._steps import StepTest, _metrics, run_steps
 from softneck.verification._verify import to_json
 
@@ -171,6 +171,107 @@ def test_what_no_loop_can_do_is_refused_at_the_border(require: dict[str, Any], p
     else:
         with pytest.raises(SettingsError):
             make_requirements({"require": require})
+
+
+@pytest.mark.parametrize(
+    ("table", "right"),
+    [
+        *(
+            ({"require": {metric: {bound: limit}}}, right)
+            for metric, bound, inside, beyond in (
+                ("axes.phase_margin_deg", "max", 179.9, 180.0), ("roll.disk_margin", "max", 1.99, 2.0),
+                ("axes.gain_margin", "min", 1.01, 1.0), ("pitch.sensitivity", "min", 1.01, 1.0),
+                ("step.rise_s", "min", 0.01, 0.0), ("stability.radius", "max", 1.0, 1.01),
+                ("robust.mu", "below", 1.0, 1.01), ("stability.searched_radius", "max", 1.0, 1.01),
+                ("step.settling_s", "max", 4.0, 4.01), ("sim.settling_s", "max", 5.0, 5.01),
+                ("step.rise_s", "min", 2.0, 2.01),
+            )
+            for limit, right in ((inside, True), (beyond, False))
+        ),
+        *(({"require": {"step.rise_s": wrong}}, False)
+          for wrong in ({}, {"most": 1.0}, {"max": math.nan}, {"max": math.inf}, {"max": True}, 1.0)),
+        ({"uncertainty": {"gain_pct": 1.0}}, True), ({"uncertainty": {"gain_pct": 0.99}}, False),
+        ({"uncertainty": {"pole_pct": 1.0}}, True), ({"uncertainty": {"pole_pct": 0.2}}, False),
+        ({"sim": {"preset": 5}}, False), ({"sim": {"decides": 1}}, False), ({"sim": {"taut_up_to_kg": 5.01}}, False),
+        ({"simm": {}}, False), ({"sim": 5}, False), ({"require": {"axes.rise_s": {"max": 1.0}}}, False),
+        ({"require": dict.fromkeys(metric_names(Robot.preset()), False)}, False),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_requirement_that_always_holds_or_means_nothing_is_refused(table: dict[str, Any], right: bool) -> None:
+    if right:
+        assert make_requirements(table).bounds
+    else:
+        with pytest.raises(SettingsError):
+            make_requirements(table)
+
+
+@pytest.mark.parametrize("reserve", [True, "1", -0.1, math.nan, math.inf, 0.5, 0.6])
+def test_a_safety_margin_that_is_none_is_refused(reserve: Any) -> None:
+    with pytest.raises(SettingsError):
+        apply_safety_margin({"sim.rise_s": {"max": 0.5}}, {"sim.rise_s": reserve})
+
+
+def test_safety_margins_are_taken_off_the_limits_that_they_name() -> None:
+    require = {"sim.rise_s": {"max": 0.5, "min": 0.1}, "sim.max_rad": False, "track.circle_rms_deg": {"max": 3.0}}
+    less, kept = apply_safety_margin(require, {"sim.max_rad": 1.0, "sim.rise_s": 0.1, "track.circle_rms_deg": 0.0})
+    assert less == {**require, "sim.rise_s": {"max": 0.4, "min": 0.1}}
+    assert kept == {"sim.rise_s": 0.1}
+    for reserve, asked in (({"axes.sensitivity": 0.1}, {"axes.sensitivity": {"max": 2.0}}), ({"sim.rise_s": 0.1}, {}),
+                           (5, {}), ({}, 5)):  # fmt: skip
+        with pytest.raises(SettingsError):
+            apply_safety_margin(asked, reserve)  # pyright: ignore[reportArgumentType]
+    own = {"require": {**require, "sim.rise_s": {"max": 0.5}}, "reserve": {"sim.rise_s": 0.1}, "track": {}, "sim": {}}
+    assert select_for_verify(own) == {"require": {"sim.rise_s": {"max": 0.4}, "sim.max_rad": False}, "sim": {}}
+
+
+def test_a_flat_table_is_of_simulation_models_where_there_are_any() -> None:
+    def flat(stepping: bool, **table: Any) -> Any:
+        return expand_metrics(table, Robot.preset(), stepping=stepping)
+
+    assert flat(True, overshoot_pct=5) == {"require": {"sim.overshoot_pct": {"max": 5}}}
+    assert flat(False, overshoot_pct=5) == {"require": {"step.overshoot_pct": {"max": 5}}}
+    found = flat(False, gain_margin=2, mu={"below": 1}, sampling={"seed": 3}, require={"step.rise_s": 1})
+    assert found == {
+        "sampling": {"seed": 3},
+        "require": {"step.rise_s": 1, "axes.gain_margin": {"min": 2}, "robust.mu": {"below": 1}},
+    }
+    assert flat(True, slack_s=False)["require"] == {"sim.slack_s": False}
+    for wrong in ({"overshot_pct": 5}, {"rise_s": 1, "require": 5}):
+        with pytest.raises(SettingsError):
+            flat(True, **wrong)
+    with pytest.raises(SettingsError, match="a file or a table"):
+        read_requirements(5)  # pyright: ignore[reportArgumentType]
+
+
+def test_where_draws_decide_the_error_under_the_load_is_asked_of_their_loops_too() -> None:
+    plain = make_requirements({"require": {"step.load_rms_deg": {"max": 1.5}}})
+    more = plain.over_draws()
+    assert more.bounds[: len(plain.bounds)] == plain.bounds
+    assert more.bounds[len(plain.bounds) :] == (Requirement("sim.load_rms_deg", "max", 1.5, True),)
+    own = make_requirements({"require": {"sim.load_rms_deg": {"max": 1.0}}})
+    assert own.over_draws() is own
+
+
+def test_limits_of_a_robot_scale_by_time_size_load_and_noise_each_where_it_belongs() -> None:
+    scale = Scale(time=2.0, size=3.0, load=4.0, noise=5.0)
+    factors = {"load_rad": 4.0, "noise_deg": 5.0, "circle_rad_s": 0.5, "size_deg": 3.0, "steady_rms_deg": 5.0,
+               "settling_s": 2.0, "delay_ms": 2.0, "orientations_deg": 1.0, "phase_margin_deg": 1.0,
+               "mu": 1.0}  # fmt: skip
+    assert {name: scale.factor(name) for name in factors} == factors
+    assert Scale(size=3.0, noise=1.0).factor("steady_rms_deg") == 3.0
+    given = {"settling_s": {"max": 1.0, "min": 3}, "delay_ms": True, "mu": 7.0, "sim.rise_s": [1.0], "size_deg": "x"}
+    assert scale.table(given) == {**given, "settling_s": {"max": 2.0, "min": 6.0}}
+    robot = Robot.preset("finger")
+    other = Scale.of(robot)
+    assert other.noise == pytest.approx(other.size if robot.noise_std is None else other.noise)
+    assert (Scale.of(Robot.preset()).size, Scale.of(Robot.preset()).noise) == (pytest.approx(1.0), pytest.approx(1.0))
+    # A scale that is known stays; that of another robot has its own defaults.
+    asked = make_requirements({"require": {"step.settling_s": {"max": 1.0}}})
+    assert asked.at(Scale(time=9.0)) is asked
+    unknown = make_requirements({}, scale=Scale(known=False))
+    assert unknown.at(Scale(time=9.0)).scale.time == 9.0
+    assert asked.at(other).scale is other
 
 
 def test_json_values_of_everything_and_nothing_else() -> None:
