@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softneck.core import CheckFailedError
+from softneck.core import CheckFailedError, SettingsError
 from softneck.drives import default_drives
 from softneck.drives.bus._objects import CSP, GUARDING_OBJECTS, HOMED_MARK, Write
 from softneck.drives.bus._sdo import SdoError
+from softneck.drives.logs._result import CycleTimes
 from softneck.drives.master import Frame, MasterSettings, Phase, Tilt
 from softneck.drives.master._cia402 import DriveState
 from softneck.drives.master._events import Event
@@ -21,12 +22,17 @@ from softneck.drives.master._gate import BAD, DROPOUT, FROZEN, Gate
 from softneck.drives.master._master import Master, Measurement
 from softneck.drives.master._settings import LimitSettings, WatchSettings
 from softneck.drives.master._watches import Watches, timing
-from softneck.drives.running import _certified, _preflight, _stop
+from softneck.drives.running import _bus_loop, _certified, _preflight, _stop
+from softneck.drives.running._bus_loop import RunEnd, Session
 from softneck.drives.running._certified import SAME, _as_strict, require_same_again
-from softneck.drives.running._pilot import SignalLog
+from softneck.drives.running._pilot import LoopPilot, SignalLog, SignalPilot, raised_cosine
 from softneck.drives.running._preflight import PreflightCheck, Report, foreign_master, set_points_of_others
 from softneck.drives.running._stop import require_reset, require_stopped
+from softneck.drives.running._timing import Ask
+from softneck.loop import Loop
 from softneck.signals import NECK
+
+from .test_any_robot import Ports
 
 FILE = default_drives()
 ENTRY = FILE.drives[0]
@@ -377,6 +383,293 @@ def test_a_requirement_is_as_strict_up_to_the_default_itself(bound: str) -> None
         assert not _as_strict(row | change, bound, 2.0)
     assert not _as_strict(row, bound, math.nan)
     assert _as_strict(row | {"bound": "below"}, bound, 2.0) is (bound == "max")
+
+
+def test_a_certificate_of_another_robot_is_refused() -> None:
+    def of(contents: dict[str, Any]) -> Any:
+        return SimpleNamespace(path="c.json", contents=contents)
+
+    _certified._require_robot(of({}), NECK)
+    _certified._require_robot(of({"robot": {"hash": NECK.hash}}), NECK)
+    for robot in ({"hash": "0" * 64}, {"hash": None}, {}):
+        with pytest.raises(CheckFailedError, match="is of the robot with the hash"):
+            _certified._require_robot(of({"robot": robot}), NECK)
+
+
+# -- the loop on the bus ----------------------------------------------------------------------------------------------
+
+
+class Led:
+    """A master that counts what it is told."""
+
+    def __init__(self, cycles: int = 3) -> None:
+        self.settings: Any = SimpleNamespace(bus=SimpleNamespace(cycle=0.02))
+        self.told, self.cycles, self.events = list[Any](), cycles, list[Any]()
+        self.counts = dict.fromkeys(("left", "operator", "not_off", "loop_failed"), 0)
+        self.supervisor: Any = SimpleNamespace(fault=None, rehome=False, revoke=self.told.append)
+        self.starved, self.tensions, self.cycle = False, (1.0, 2.0, 3.0), 7
+        self.bus: Any = SimpleNamespace(signs_of_life=lambda: ("sign",))
+
+    def stop(self, why: str) -> None:
+        self.told.append(("stop", why))
+
+    def leave(self, why: str) -> None:
+        self.told.append(("leave", why))
+
+    @property
+    def finished(self) -> bool:
+        return self.cycles == 0
+
+    @property
+    def sample_due(self) -> bool:
+        return self.cycles % 2 == 1
+
+    def step(self, now: float, frames: Any, tilt: Any) -> list[Any]:
+        self.cycles -= 1
+        self.told.append((round(now, 6), frames, tilt))
+        return [self.cycles]
+
+
+def test_an_operator_stops_or_leaves_or_neither() -> None:
+    for ask, told in ((Ask.STOP, [("stop", "asked to")]), (Ask.LEAVE, [("leave", "asked to")]), (None, [])):
+        master: Any = Led()
+        _bus_loop._ask(master, ask)
+        assert master.told == told
+
+
+@pytest.mark.parametrize(
+    ("states", "off"),
+    [({1: "DISABLED", 2: "DISABLED"}, True), ({1: "DISABLED", 2: "ENABLED"}, False),
+     ({1: "ENABLED", 2: "DISABLED"}, False),
+     ({1: "no answer", 2: "DISABLED"}, False), (OSError("gone"), False)],
+    ids=str,
+)  # fmt: skip
+def test_after_an_error_the_drives_are_fed_only_if_all_are_off(
+    states: Any, off: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(link: Any, file: Any) -> dict[int, str]:
+        assert (link, file) == ("guarded", FILE)
+        if isinstance(states, Exception):
+            raise states
+        return states
+
+    monkeypatch.setattr(_bus_loop, "stop", stop)
+    given: list[Any] = []
+    monkeypatch.setattr(_bus_loop, "GuardedLink", lambda *args: given.append(args) or "guarded")
+    link: Any = object()
+    assert _bus_loop._emergency_stop(link, FILE, Led()) is off  # pyright: ignore[reportArgumentType]
+    assert given == [(link, ("sign",), FILE.guard_cycles * FILE.cycle)]
+
+
+@pytest.mark.parametrize("faulted", [False, True])
+@pytest.mark.parametrize("left", [{}, {2: "it is in ENABLED"}, OSError("gone")], ids=str)
+def test_a_drive_that_is_not_off_ends_a_run_that_looked_done(
+    left: Any, faulted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def disarm(link: Any, file: Any, guarding: str, signs: Any) -> dict[int, str]:
+        assert (guarding, signs) == ("life", ("sign",))
+        if isinstance(left, Exception):
+            raise left
+        return left
+
+    monkeypatch.setattr(_bus_loop, "disarm", disarm)
+    master: Any = Led()
+    master.supervisor.fault = "earlier" if faulted else None
+    found = _bus_loop._switch_off(SimpleNamespace(now=3.0), FILE, "life", master, ("sign",))  # pyright: ignore[reportArgumentType]
+    assert found is (left if isinstance(left, Exception) else None)
+    named = [] if faulted else list(FILE.nodes) if isinstance(left, Exception) else list(left)
+    assert [(event.name, event.node, event.time) for event in master.events] == [
+        ("not_off", node, 3.0) for node in named
+    ]
+    assert master.told == master.events
+    assert master.counts["not_off"] == len(named)
+
+
+def test_the_end_of_a_run_says_who_ended_it_and_raises_what_did() -> None:
+    for counts, left in (((0, 0), False), ((1, 0), True), ((0, 1), True), ((1, 1), True)):
+        master: Any = Led()
+        master.counts.update(zip(("left", "operator"), counts, strict=True))
+        end = RunEnd(master, CycleTimes(0.02), 1.0)
+        assert end.left is left
+        end.require()
+    with pytest.raises(OSError, match="gone"):
+        RunEnd(master, CycleTimes(0.02), 1.0, error=OSError("gone")).require()
+
+
+def test_in_real_time_each_cycle_reads_asks_steps_sends_and_keeps_its_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [10.0]
+    monkeypatch.setattr(_bus_loop.time, "sleep", lambda rest: clock.__setitem__(0, clock[0] + rest))
+
+    class Line:
+        def __init__(self) -> None:
+            self.sent = list[Any]()
+
+        @property
+        def now(self) -> float:
+            return clock[0]
+
+        def receive(self, seconds: float) -> list[str]:
+            assert seconds == 0.0
+            return ["frame"]
+
+        def send(self, frames: Any) -> None:
+            self.sent.append(frames)
+            # The third cycle stalls for four periods.
+            clock[0] += 0.09 if len(self.sent) == 3 else 0.004
+
+    seen: list[Any] = []
+    sensor = SimpleNamespace(read=lambda _, frames: ("tilt", frames), take=lambda frames: seen.append(("take", frames)))
+    master: Any = Led(6)
+    session: Any = SimpleNamespace(sensor=sensor, operator=lambda: None if master.cycles else Ask.STOP,
+                                   watches=(lambda *args: seen.append(("watch", args[2], args[3])),))  # fmt: skip
+    times, cycles = CycleTimes(0.02), list[float]()
+    notifier: Any = SimpleNamespace(cycle=lambda now, _: cycles.append(round(now, 6)))
+    line: Any = Line()
+    _bus_loop._in_real_time(session, line, master, times, notifier)
+    tilt = ("tilt", ["frame"])
+    # After the stall the next comes at once, another half a period later: the lost ones are not made up for.
+    assert master.told == [
+        (10.0, ["frame"], None), (10.02, ["frame"], tilt), (10.04, ["frame"], None), (10.13, ["frame"], tilt),
+        (10.14, ["frame"], None), (10.16, ["frame"], tilt),
+    ]  # fmt: skip
+    assert cycles == [now for now, _, _ in master.told]
+    assert line.sent == [[k] for k in (5, 4, 3, 2, 1, 0)]
+    assert seen[:3] == [("take", ["frame"]), ("watch", [5], None), ("watch", [4], tilt)]
+    assert times.count == 5
+
+
+def test_an_operator_is_asked_in_every_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_bus_loop.time, "sleep", lambda _: None)
+    asks = iter([None, Ask.LEAVE, Ask.STOP])
+    master: Any = Led(3)
+    sensor = SimpleNamespace(read=lambda *_: None, take=lambda *_: None)
+    session: Any = SimpleNamespace(sensor=sensor, operator=lambda: next(asks), watches=())
+    line: Any = SimpleNamespace(now=1.0, receive=lambda _: [], send=lambda _: None)
+    notifier: Any = SimpleNamespace(cycle=lambda *_: None)
+    _bus_loop._in_real_time(session, line, master, CycleTimes(0.02), notifier)
+    assert [item for item in master.told if isinstance(item[0], str)] == [("leave", "asked to"), ("stop", "asked to")]
+    # In virtual time as well, where a pace makes the wall clock wait.
+    waited: list[float] = []
+    monkeypatch.setattr(_bus_loop.time, "sleep", waited.append)
+    monkeypatch.setattr(_bus_loop.time, "perf_counter", lambda: 100.0)
+
+    class Run:
+        def __init__(self, link: Any, _: Any, *, watches: Any) -> None:
+            self.link, self.watches = link, watches
+
+        def run(self, most: float) -> None:
+            for _ in range(3):
+                self.link.now += self.link.cycle
+                for watch in self.watches:
+                    watch(self.link.now, [], [], None, None)
+            seen.append(most)
+
+    seen: list[Any] = []
+    monkeypatch.setattr(_bus_loop, "VirtualRun", Run)
+    asks, master = iter([Ask.LEAVE, None, Ask.STOP]), Led()  # pyright: ignore[reportAssignmentType]
+    session = SimpleNamespace(operator=lambda: next(asks), pace=2.0, watches=(lambda *_: seen.append("watch"),))
+    link: Any = SimpleNamespace(now=5.0, cycle=0.02)
+    _bus_loop._in_virtual_time(session, link, master, times := CycleTimes(0.02), 9.0)
+    assert master.told == [("leave", "asked to"), ("stop", "asked to")]
+    assert waited == pytest.approx([0.02, 0.03, 0.04])
+    assert (times.count, seen) == (2, ["watch"] * 3 + [9.0])
+
+
+@pytest.mark.parametrize("failure", [None, OSError("gone"), KeyboardInterrupt()], ids=str)
+@pytest.mark.parametrize("fed", [True, False])
+def test_whatever_ends_a_run_the_drives_are_switched_off(
+    failure: BaseException | None, fed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Signs of life go on while they are switched off only if all are off already, or the master was never starved."""
+    master: Any = Led()
+    master.start, master.starved = (lambda: master.told.append("start")), not fed
+    master.supervisor.phase = Phase.RUNNING
+    calls: list[Any] = []
+
+    def loop(*_: Any) -> None:
+        if failure is not None:
+            raise failure
+
+    checked = SimpleNamespace(require=lambda: calls.append("required"), guarding="life", late_modes=[2])
+    for name, value in {
+        "preflight": lambda *_, **given: calls.append(given) or checked, "Master": lambda *_: master,
+        "_in_real_time": loop,
+        "_emergency_stop": lambda *_: calls.append("stop") or fed,
+        "_switch_off": lambda *args: calls.append(args[-1]) or "failed",
+    }.items():  # fmt: skip
+        monkeypatch.setattr(_bus_loop, name, value)
+    monkeypatch.setattr(_bus_loop.time, "sleep", lambda _: None)
+    sent: list[Any] = []
+    link: Any = SimpleNamespace(now=4.0, send=sent.extend, receive=lambda _: [], tap=None)
+    sensor: Any = object()
+    session = Session(file=FILE, link=link, sensor=sensor, override=("homed",))
+    begun: list[Any] = []
+    told: Any = SimpleNamespace(ready=lambda: calls.append("ready"))
+
+    def run() -> RunEnd:
+        return _bus_loop._run_session(session, Pilot(), 0.02, 9.0, begun.append, told)
+
+    if isinstance(failure, KeyboardInterrupt):
+        with pytest.raises(KeyboardInterrupt):
+            run()
+        assert calls[-1] == "stop"
+        return
+    end = run()
+    assert calls[0] == {"override": ("homed",), "homed": True, "sensor": session.sensor}
+    assert calls[1:] == ["required", "ready", *["stop"] * bool(failure), ("sign",) if fed else ()]
+    assert end.error == (failure or "failed")
+    assert begun == [master]
+    assert "start" in master.told
+    assert len(sent) == len(FILE.nodes)
+    assert master.counts["loop_failed"] == bool(failure)
+    blind = Session(file=FILE, link=link)
+    with pytest.raises(SettingsError, match="need an inclinometer"):
+        _bus_loop._run_session(blind, Pilot(), 0.02, 9.0, None, told)
+
+
+# -- pilots -----------------------------------------------------------------------------------------------------------
+
+
+def test_signals_are_played_row_by_row_and_ways_are_smooth() -> None:
+    rows = np.arange(6.0).reshape(2, 3)
+    pilot = SignalPilot(rows)
+    measured: Any = SimpleNamespace(index=1)
+    assert pilot.step(measured) == (3.0, 4.0, 5.0)
+    assert [pilot.is_finished(k) for k in (0, 1, 2)] == [False, False, True]
+    way = raised_cosine(4)
+    np.testing.assert_allclose(way, [0.5 - 0.5 * math.cos(k * math.pi / 4) for k in (1, 2, 3, 4)], rtol=1e-12)
+
+
+def _plant(*outputs: str) -> Any:
+    return Ports("plant", [f"motor_setpoint_{j}" for j in (1, 2, 3)], list(outputs))
+
+
+def _loop(**changes: Any) -> Loop:
+    asked = ["pitch_reference", "roll_reference", "pitch", "roll"]
+    told = ("pitch", "roll", "motor_position_1", "motor_position_3", "measurement_valid", "roll_rate")
+    settings = {"plant": _plant(*told),
+                "controller": Ports("controller", asked, [f"motor_setpoint_{j}" for j in (1, 2, 3)]),
+                "reference": lambda t: (t, -t, 0.0), "duration": 1.0, **changes}  # fmt: skip
+    return Loop(**settings)
+
+
+def test_a_measurement_goes_to_the_plant_s_outputs_each_to_its_own() -> None:
+    pilot = LoopPilot(_loop())
+    outputs = np.full(6, 9.0)
+    for fresh in (True, False):
+        tilt = Tilt(0.1, -0.2, 0.3, math.nan)
+        pilot._measure(Measurement(0, tilt, fresh, (1.0, 2.0, 3.0)), outputs)
+        assert outputs.tolist() == [0.1, -0.2, 1.0, 3.0, float(fresh), 0.0]
+    assert [pilot.is_finished(index) for index in (49, 50)] == [False, True]
+
+
+def test_a_loop_that_drives_cannot_run_is_refused() -> None:
+    with pytest.raises(SettingsError, match="sequential"):
+        LoopPilot(_loop(order="jacobi"))
+    slow = Ports("controller", ["pitch"], [f"motor_setpoint_{j}" for j in (1, 2, 3)])
+    slow.sample_time = 0.04
+    with pytest.raises(SettingsError, match=r"need one sample time; it has .*0\.04 s"):
+        LoopPilot(_loop(controller=slow))
 
 
 # -- the master -------------------------------------------------------------------------------------------------------
