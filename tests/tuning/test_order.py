@@ -10,22 +10,28 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softneck.core import metric_of
+from softneck.core import KINDS, DataError, SettingsError, metric_of, resolve
 from softneck.loop import LoopResult
 from softneck.robot import Robot
-from softneck.tuning import _judge
+from softneck.tuning import _judge, _search
 from softneck.tuning._judge import (
+    LEVELS,
     Case,
+    cases,
+    judge_candidate,
     keep_worse,
     linear_metrics,
     loop_metrics,
+    loop_of,
     margin_metrics,
     run_case,
     told_conditions,
     variation,
 )
-from softneck.tuning._search import Candidate, ratio
-from softneck.tuning._task import Judgement
+from softneck.tuning._requirements import make_tune_requirements
+from softneck.tuning._search import Candidate, Search, ratio
+from softneck.tuning._space import COSTLY
+from softneck.tuning._task import Job, Judgement, circle_angles
 from softneck.tuning._tune import front
 from softneck.verification import LARGE, SMALL, Scale, metric_names
 from softneck.verification._linear import AxisMargins
@@ -318,3 +324,387 @@ def test_a_default_payload_that_was_not_recorded_is_told(
     found = told_conditions(task, [], TS)
     assert list(found) == ["payload 1 kg"] * told
     assert all(text.startswith("judged with at most 0 kg") and "--payload 1`" in text for text in found.values())
+
+
+# -- the loops of a candidate -----------------------------------------------------------------------------------------
+
+
+def task_for(table: dict[str, Any], robot: str = "neck", **more: Any) -> Any:
+    asked = make_tune_requirements(table, robot=Robot.preset(robot))
+    return SimpleNamespace(
+        **{"asked": asked, "robot": asked.certificate.robot, "cocontraction": None, "seed": 3, "own": {}, "linear": {},
+           "drawn": (), "models": [], "observer": None, **more}
+    )  # fmt: skip
+
+
+CONDITIONS = {"sim": {"payloads_kg": [0.5, 0.0], "orientations_deg": [0.0, 45.0, 90.0]}, "track": {"small_part": 0.3}}
+
+
+@pytest.mark.parametrize("robot", ["neck", "finger"])
+def test_every_plant_payload_direction_and_size_is_a_loop_and_a_circle_where_there_are_two_angles(robot: str) -> None:
+    task = task_for(CONDITIONS, robot)
+    own: list[Any] = [SimpleNamespace(payloads=lambda kg: kg), SimpleNamespace(payloads=lambda _: [1.0])]
+    found = cases(own, task.asked, task.robot)
+    angles = [0.0, math.pi / 4, math.pi / 2] if robot == "neck" else [0.0]
+    expected = set()
+    for plant, kg in ((0, 0.0), (0, 0.5), (1, 1.0)):
+        expected |= {Case(plant, kg, angle, noise=noisy) for angle in angles for noisy in (False, True)}
+        expected |= {Case(plant, kg, angle, part=0.3, noise=True) for angle in (angles[0], angles[-1])}
+        expected |= {Case(plant, kg, noise=True, late=True)}
+        expected |= {Case(plant, kg, circle=True)} if robot == "neck" else set()
+    assert set(found) == expected
+    assert len(found) == len(expected)
+
+
+def _port(name: str, start: float = 0.0) -> Any:
+    return SimpleNamespace(name=name, start=start)
+
+
+@pytest.mark.parametrize("pulls", [0.0, 0.6, None])
+@pytest.mark.parametrize("common", [None, 0.0, 0.4])
+def test_the_cocontraction_that_is_asked_is_judged_unless_the_controller_pulls_by_its_own(
+    pulls: float | None, common: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Asked, judged, told: all loops are held at the recordings' co-contraction, from three seconds before the step."""
+    monkeypatch.setattr(_judge, "step_loop", lambda *args, **more: (args, more))
+    task = task_for(CONDITIONS, cocontraction=common)
+    own = [] if pulls is None else [_port("least_cocontraction", pulls)]
+    block: Any = SimpleNamespace(parameters=[_port("other"), *own], sample_time=TS)
+    plant: Any = SimpleNamespace(quiet=lambda ts: ("quiet", ts))
+    args, more = loop_of(Case(0, 0.5, math.pi / 2, part=0.3), plant, block, "parallel", task)  # pyright: ignore[reportGeneralTypeIssues]
+    reference = args[4]
+    together = 0.0 if pulls is not None else common or 0.0
+    at = 3.0 if pulls or together else 0.5
+    assert reference(at + 0.1) == pytest.approx((0.0, 0.3 * math.radians(15.0), together), abs=1e-12)
+    assert reference(at - 0.01) == (0.0, 0.0, together)
+    assert (args[1], args[3], more["duration"], more["order"]) == (("quiet", TS), 0.5, at + 5.0, "parallel")
+    assert more["faults"] == []
+
+
+def test_noise_delay_and_circle_of_a_loop_are_those_that_are_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_judge, "step_loop", lambda *args, **more: SimpleNamespace(reference=args[4], **more))
+    block: Any = SimpleNamespace(parameters=[], sample_time=TS)
+    plant: Any = SimpleNamespace(quiet=lambda ts: ts)
+    track = {"noise_deg": 0.2, "delay_ms": 47.0, "circle_rad_s": 2.0, "circle_deg": 12.0}
+
+    def loop(case: Case, **changes: Any) -> Any:
+        return loop_of(case, plant, block, "sequential", task_for({"track": {**track, **changes}}))
+
+    [noise] = loop(Case(2, 0.0, math.radians(45.0), noise=True)).faults
+    assert (noise.kind, noise.std, noise.seed) == ("noise", pytest.approx(math.radians(0.2)), 3 + 2000 + 45)
+    noise, delay = loop(Case(0, 0.0, noise=True, late=True)).faults
+    assert (delay.kind, delay.delay) == ("delay", pytest.approx(2 * TS))
+    assert loop(Case(0, 0.0, noise=True, late=True), noise_deg=0.0, delay_ms=0.0).faults == []
+    circle = loop(Case(0, 0.0, circle=True))
+    # Half a second to begin, two to reach it, two turns of pi seconds.
+    assert circle.duration == pytest.approx(2.5 + 2.0 * math.pi)
+    angles = np.array([circle.reference(t)[:2] for t in 2.5 + np.linspace(0.0, math.pi, 9)])
+    np.testing.assert_allclose(np.hypot(*angles.T), math.radians(12.0), rtol=0.05)
+    turned = np.unwrap(np.arctan2(angles[:, 1], angles[:, 0]))
+    assert abs(turned[-1] - turned[0]) == pytest.approx(2.0 * math.pi, rel=0.02)
+
+
+def _circle(lag: int, rows: int = 700, offset: float = 0.0) -> LoopResult:
+    """Return a circle of 2 rad/s at 0.2 rad whose outputs come `lag` samples late."""
+    t = np.arange(rows) * TS
+    r = {"pitch": 0.2 * np.cos(2.0 * t), "roll": 0.2 * np.sin(2.0 * t)}
+    late = {"pitch": 0.2 * np.cos(2.0 * (t - lag * TS)) + offset, "roll": 0.2 * np.sin(2.0 * (t - lag * TS))}
+    signals = late | {f"{name}_reference": values for name, values in r.items()}
+    return LoopResult(t, signals | {f"motor_setpoint_{j}": np.full(rows, 0.1 * j) for j in (1, 2, 3)}, {}, TS)
+
+
+@pytest.mark.parametrize("lag", [0, 3, 40])
+def test_the_distance_to_a_circle_is_least_at_the_lead_that_its_lag_asks_for(
+    lag: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_judge, "run_loop", lambda *_, **__: _circle(lag))
+    task, loop = task_for({"track": {"circle_rad_s": 2.0}}), SimpleNamespace(controller=SimpleNamespace(sample_time=TS))
+    found = _judge._distances(loop, task)  # pyright: ignore[reportArgumentType]
+    # 0.8 s of leads, each a sample.
+    assert found.shape == (41,)
+    leads = np.arange(41)
+    expected = np.degrees(0.4 * np.abs(np.sin((leads - lag) * TS)))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+    def overflow(*_: Any, **__: Any) -> LoopResult:
+        raise DataError("overflow")
+
+    monkeypatch.setattr(_judge, "run_loop", overflow)
+    assert np.isinf(_judge._distances(loop, task)).all()  # pyright: ignore[reportArgumentType]
+
+
+def test_the_radius_of_a_circle_is_that_of_its_last_turn_at_the_angles_of_the_page() -> None:
+    task = task_for({"track": {"circle_rad_s": 2.0}})
+    found = _judge._radius(_circle(5, offset=0.05), task)
+    angles = circle_angles()
+    # A circle around (0.05, 0), seen from the origin.
+    expected = 0.05 * np.cos(angles) + np.sqrt(0.04 - (0.05 * np.sin(angles)) ** 2)
+    np.testing.assert_allclose(found, np.degrees(expected), rtol=2e-3)
+
+
+def test_curves_are_of_the_plain_steps_from_the_lowest_to_the_highest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps without noise, of full size, along the first output; the last plant's own curve and set-points."""
+    task = task_for({"track": {"circle_rad_s": 2.0}}, own={"a": None})
+    plants = [0, 1]
+    every = [
+        Case(k, 0.0, angle, noise=noisy) for k in plants for angle in (math.pi / 2, 0.0) for noisy in (True, False)
+    ]
+    every += [Case(1, 0.0, part=0.3), Case(1, 0.0, late=True)]
+    run: list[Case] = []
+
+    def result(loop: Any, *, compiled: bool) -> LoopResult:
+        run.append(loop)
+        if loop.circle:
+            return _circle(2 + loop.plant)
+        t = np.arange(300) * TS
+        on = (t >= 0.5).astype(float)
+        size = 0.1 * (1 + loop.plant)
+        signals = {"pitch": size * on, "roll": 9.0 * on, "pitch_reference": 0.2 * on, "roll_reference": 0.0 * on}
+        return LoopResult(t, signals | {f"motor_setpoint_{j}": j * on for j in (1, 2, 3)}, {}, TS)
+
+    monkeypatch.setattr(_judge, "loop_of", lambda case, *_: case)
+    monkeypatch.setattr(_judge, "run_loop", result)
+
+    def curves(cases: list[Case]) -> dict[str, list[float]]:
+        ready: Any = SimpleNamespace(all=cases, own=plants, weights=None)
+        return _judge.loop_curves(task, ready, None, "sequential")  # pyright: ignore[reportArgumentType]
+
+    found = curves(every)
+    assert run == [Case(0, 0.0), Case(1, 0.0)]
+    assert (found["low"][-1], found["high"][-1], found["value"][-1]) == pytest.approx(
+        (math.degrees(0.1), math.degrees(0.2), math.degrees(0.2)), rel=1e-3
+    )
+    assert found["low"][0] == pytest.approx(math.degrees(0.1), rel=1e-3)
+    assert found["reference"] == [pytest.approx(math.degrees(0.2), rel=1e-3)]
+    assert [found[f"set_point_{j}"][0] for j in (1, 2, 3)] == [1.0, 2.0, 3.0]
+    assert found["tautness"][-1] == pytest.approx(2.0)
+    assert "circle" not in found
+    circled = curves([*every, Case(0, 0.0, circle=True), Case(1, 0.0, circle=True)])
+    assert circled["circle"] == pytest.approx([math.degrees(0.2)] * circle_angles().size, rel=1e-3)
+    assert circled["circle_low"] == pytest.approx(circled["circle_high"], rel=1e-3)
+
+    def overflow(*_: Any, **__: Any) -> LoopResult:
+        raise DataError("overflow")
+
+    monkeypatch.setattr(_judge, "run_loop", overflow)
+    assert curves(every) == {}
+    assert _judge._finite_curves({"a": np.array([1.0, math.nan])}) == {}
+    assert _judge._finite_curves({"a": np.array([math.inf])}) == {}
+    assert _judge._finite_curves({"a": np.array([1.23456])}) == {"a": [1.235]}
+
+
+def test_linear_curves_are_of_the_first_output_with_the_nominal_plant_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    t = np.arange(400) * TS
+    y = np.zeros((2, 3, 400))
+    y[0] = np.array([0.2, 0.1, 0.3])[:, None] * np.ones(400)
+    y[:, :, 200:] = 7.0  # under the load
+    P = np.zeros((2, 3, 400, 3))
+    P[0, 0] = [1.0, 2.0, 3.0]
+    tests: list[Any] = []
+
+    def run(plants: Any, block: Any, test: Any, **_: Any) -> Any:
+        tests.append(test)
+        return SimpleNamespace(time=t, angles=y, motors=P)
+
+    plants: Any = SimpleNamespace(later=lambda extra: ("later", extra))
+    monkeypatch.setattr(_judge, "run_steps", run)
+    monkeypatch.setattr(_judge, "controller_under_test", lambda *_, **__: SimpleNamespace(extra=1, block=None))
+    task = task_for({"step": {"duration_s": 4.0}})
+    found = _judge.linear_curves(task, SimpleNamespace(plants=plants, weights=None), None)  # pyright: ignore[reportArgumentType]
+    assert (tests[0].noise, tests[0].load) == (0.0, 0.0)
+    ends = [found[name][-1] for name in ("low", "high", "value")]
+    assert ends == pytest.approx([math.degrees(v) for v in (0.1, 0.3, 0.2)], rel=1e-3)
+    assert [found[f"set_point_{j}"][-1] for j in (1, 2, 3)] == [1.0, 2.0, 3.0]
+    assert found["reference"] == [15.0]
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("own", [True, False])
+def test_each_level_computes_its_own_and_an_error_of_a_design_is_told(
+    level: str, own: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ready: Any = SimpleNamespace(own=[1] * own, all=("case",))
+    controller = SimpleNamespace(block=lambda: "block", order="parallel")
+    monkeypatch.setattr(_judge, "prepare", lambda _: ready)
+    monkeypatch.setattr(_judge, "design_candidate", lambda *_: controller)
+    monkeypatch.setattr(_judge, "make_observer", lambda *_: "eyes")
+    for name in ("linear_metrics", "loop_metrics", "margin_metrics", "linear_curves", "loop_curves"):
+        monkeypatch.setattr(_judge, name, lambda *args, name=name: {name: args[2:]})
+    found = judge_candidate(task_for({}), "pi", {}, level)
+    if level == "linear":
+        assert found.metrics == {"linear_metrics": (controller,)}
+        assert bool(found.curves) is not own
+    elif level == "margins":
+        assert found.metrics == {"margin_metrics": ("block", "parallel", "eyes")}
+    else:
+        assert found.metrics == {"loop_metrics": ("block", "parallel", ("case",), "eyes")}
+        assert found.curves == {"loop_curves": ("block", "parallel", "eyes")}
+    assert not found.error
+
+    def fails(*_: Any) -> Any:
+        raise SettingsError("no\n  way")
+
+    monkeypatch.setattr(_judge, "design_candidate", fails)
+    found = judge_candidate(task_for({}), "pi", {}, level)
+    assert (dict(found.metrics), found.error, dict(found.curves)) == ({}, "no way", {})
+
+
+def test_each_kind_is_designed_on_its_plant() -> None:
+    light, heavy = SimpleNamespace(arrays={}), SimpleNamespace(arrays={"payload": np.array([0.0, 1.0, -3.0, -0.2])})
+    task = task_for({}, models=[light, heavy], linear={"a": "first", "b": "second"}, plant="plant")
+    ready: Any = SimpleNamespace(uncertain="uncertain")
+
+    def plant_of(kind: str, task: Any = task) -> Any:
+        return _judge._plant_for(task, ready, kind, resolve(KINDS[kind].settings)())
+
+    assert (plant_of("pi"), plant_of("adaptive"), plant_of("mpc")) == ("uncertain", "first", "plant")
+    assert plant_of("nmpc") is heavy
+    assert plant_of("nmpc", task_for({}, plant="plant")) == "plant"
+
+
+# -- the course of a search -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bound", ["min", "max", "below"])
+def test_a_ratio_is_one_at_the_limit_and_above_it_beyond(bound: str) -> None:
+    item, sign = Requirement("m", bound, 2.0, True), -1.0 if bound == "min" else 1.0
+    assert ratio(item, 2.0 - 0.1 * sign) < 1.0 < ratio(item, 2.0 + 0.1 * sign)
+    assert (ratio(item, 2.0) <= 1.0) is (bound != "below")
+    zero = Requirement("m", bound, 0.0, True)
+    if bound != "min":
+        assert ratio(zero, 0.1) == math.inf
+        assert ratio(zero, -0.1) == 0.0
+        assert ratio(zero, 0.0) == (0.0 if bound == "max" else math.inf)
+    else:
+        assert ratio(item, 0.0) == ratio(item, -1.0) == math.inf
+
+
+def test_a_candidate_exactly_at_its_limits_holds_and_ties_are_broken_by_the_mean() -> None:
+    bounds = (Requirement("sim.rise_s", "max", 0.4, True), Requirement("sim.overshoot_pct", "max", 5.0, True))
+
+    def of(**metrics: float) -> Candidate:
+        named = {name.replace("__", "."): value for name, value in metrics.items()}
+        return Candidate("pi", {}, np.zeros(1), "all", {"axes.sensitivity": 1.2} | named)
+
+    edge = of(sim__rise_s=0.4, sim__overshoot_pct=5.0)
+    assert edge.holds(bounds, tested=False)
+    assert edge.cost(bounds, tested=False) == pytest.approx(1.0, rel=1e-12)
+    half = of(sim__rise_s=0.4, sim__overshoot_pct=2.5)
+    # The largest ratio counts by 0.98, their mean by 0.02.
+    assert half.cost(bounds, tested=False) == pytest.approx(0.98 + 0.02 * 0.75, rel=1e-12)
+    far = of(sim__rise_s=math.inf, sim__overshoot_pct=5.0)
+    assert far.cost(bounds, tested=False) == pytest.approx(1.0 + 4.0 + 0.02, rel=1e-12)
+    twice = of(sim__rise_s=0.8, sim__overshoot_pct=5.0)
+    assert twice.cost(bounds, tested=False) == pytest.approx(1.0 + 1.0 / 1.25 + 0.02, rel=1e-12)
+    broken = Candidate("pi", {}, np.zeros(1), "all", dict(edge.metrics), error="no plant")
+    assert not broken.holds(bounds, tested=False)
+    assert broken.cost(bounds, tested=False) == math.inf
+    assert not of().holds((), tested=False)
+
+
+def test_curves_stay_until_a_later_level_has_some_and_an_error_changes_nothing_else() -> None:
+    item = Candidate("pi", {}, np.zeros(1))
+    item.update("linear", Judgement({"a": 1.0}, curves={"low": [1.0]}))
+    item.update("all", Judgement({"a": 2.0, "axes.gain_margin": 3.0}))
+    assert (item.level, item.curves, item.metrics) == ("all", {"low": [1.0]}, {"a": 2.0, "axes.gain_margin": 3.0})
+    item.update("margins", Judgement({"a": 9.0}, "it broke", curves={"low": [9.0]}))
+    assert (item.level, item.error, item.curves, item.metrics["a"]) == ("all", "it broke", {"low": [1.0]}, 2.0)
+
+
+def searching(kinds: str = "abcdefg", budget: int = 20, **more: Any) -> Search:
+    spaces: Any = [SimpleNamespace(kind=kind) for kind in kinds]
+    bounds = (Requirement("m", "max", 1.0, True),)
+    task: Any = SimpleNamespace(bounds=bounds, tested=False, seed=0, **more)
+    return Search(task, spaces, None, None, budget, lambda *_: None)  # pyright: ignore[reportArgumentType]
+
+
+def of_kind(kind: str, value: float, level: str = "all", number: int = 0) -> Candidate:
+    return Candidate(kind, {}, np.array([float(number)]), level, {"m": value, "axes.sensitivity": 1.0})
+
+
+@pytest.mark.parametrize(("count", "kept"), [(1, 1), (2, 2), (3, 2), (6, 2), (7, 3)])
+def test_a_third_of_the_kinds_goes_on_and_never_fewer_than_two(count: int, kept: int) -> None:
+    search = searching("abcdefg"[:count])
+    for k, kind in enumerate("gfedcba"):
+        search.candidates[kind, "1"] = of_kind(kind, 0.1 * (k + 1))
+        search.candidates[kind, "2"] = of_kind(kind, 5.0)
+    best = [space.kind for space in search._drop_kinds(search.spaces)]
+    assert best == sorted("abcdefg"[:count], key="gfedcba".index)[:kept][::-1]
+
+
+def test_a_costly_kind_goes_on_only_as_the_best() -> None:
+    costly = next(iter(COSTLY))
+    for value, kept in ((0.1, [costly, "a"]), (0.3, ["a", "b"])):
+        search = searching("ab")
+        search.spaces.insert(0, SimpleNamespace(kind=costly))  # pyright: ignore[reportArgumentType]
+        for kind, m in (("a", 0.2), ("b", 0.5), (costly, value)):
+            search.candidates[kind, ""] = of_kind(kind, m)
+        assert [space.kind for space in search._drop_kinds(search.spaces)] == kept
+
+
+@pytest.mark.parametrize(
+    ("values", "kept"),
+    [
+        ([0.5, 0.6, 0.7, 2.0], 3),
+        ([2.0, 3.0, 4.0, 5.0], 2),
+        ([2.0, 3.0, 4.0], 2),
+        ([0.5, 2.0, 3.0, 4.0, 5.0], 3),
+        ([], 0),
+    ],
+)
+def test_what_holds_goes_on_and_at_least_the_better_half(values: list[float], kept: int) -> None:
+    search = searching()
+    items = [of_kind("a", value, number=k) for k, value in enumerate(values)]
+    others = [of_kind("a", 0.1, level="linear"), Candidate("a", {}, np.zeros(1), "all", {"m": 0.1}, error="x")]
+    found = search._select([*others, *items[::-1], *items], "all")
+    assert {id(item) for item in found} == {id(item) for item in items[:kept]}
+    assert len(found) == kept
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("budget", [1, 5, 40])
+def test_a_search_judges_starts_generations_neighbours_and_finals_within_its_budget(
+    own: bool, budget: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = searching("ab", budget=budget, own={"p": 1} if own else {})
+    said: list[Any] = []
+
+    class Optimiser:
+        def ask(self) -> np.ndarray:
+            return np.zeros(1)
+
+        def tell(self, given: Any) -> None:
+            said.append(("tell", [rank for _, rank in given]))
+
+    monkeypatch.setattr(_search, "_optimiser", lambda *_: Optimiser())
+
+    def judge(self: Search, items: Any, level: str, reserved: int) -> None:
+        said.append((level, len(items), reserved))
+        for item in items:
+            item.level = level
+            self.spent.add(Job("a", str(len(self.spent)), level))
+
+    monkeypatch.setattr(Search, "_judge", judge)
+    monkeypatch.setattr(Search, "_drop_kinds", lambda _, alive: alive[:1])
+    monkeypatch.setattr(
+        Search, "_judge_starts", lambda self, levels, finals, _: said.append((levels, finals)) or self.spaces
+    )
+    monkeypatch.setattr(Search, "_sample", lambda _, space, __: [of_kind(space.kind, 0.5, "", k) for k in range(3)])
+    monkeypatch.setattr(Search, "_refine", lambda _, levels, finals: said.append(("refine", levels, finals)))
+    best = [of_kind("a", 0.1 * k) for k in range(5)] + [of_kind("a", 0.0, "linear")]
+    monkeypatch.setattr(Search, "sort_candidates", lambda _: best)
+    search.run()
+    levels = LEVELS[:-1] if own else LEVELS[:1]
+    finals = min(3, max(0, budget - len(levels) * 2)) if own else 0
+    assert said[0] == (levels, finals)
+    # Three tenths of the budget are left to neighbours.
+    rounds = [item for item in said if item[0] == "tell"]
+    assert bool(rounds) is (budget - finals - round(0.3 * budget) > 0)
+    assert [len(item[1]) for item in rounds] == [3] * len(rounds)
+    # Both kinds have a generation in the first round, and the one that is left in each later one.
+    judged = [item[1] for item in said if item[0] == levels[0]]
+    assert judged == ([6] + [3] * (len(judged) - 1) if rounds else [])
+    assert all(item[2] == finals for item in said if item[0] in levels)
+    assert ("refine", levels, finals) in said
+    # Margins by experiment of the best that were judged as far as any; they may take all that is left.
+    assert (said[-1] == ("margins", finals, 0)) is bool(finals)
