@@ -4,25 +4,36 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from softneck.core import Matrix
+from softneck.core import DataError, Matrix, load
+from softneck.identification import Model, Rules, validate
 from softneck.identification.models._scores import nrmse_fit, r_squared, rmse, worst_error
+from softneck.identification.validation import _baselines, _error_statistics, _score_tables
 from softneck.identification.validation._error_statistics import (
+    LAGS,
+    LEVEL,
+    ResidualTests,
     _left_out,
     _path,
     _pointwise,
     calibrated_bounds,
     judged_bounds,
+    judged_validity,
     reliability,
+    residual_tests,
     useful_parts,
 )
 from softneck.identification.validation._score_tables import (
     INFINITE,
     Rows,
+    _block_sums,
     coverage_tables,
     divergence,
     fit_intervals,
@@ -31,6 +42,7 @@ from softneck.identification.validation._score_tables import (
 )
 from softneck.robot import Robot
 
+from ...data import ROOT, neck_recording
 from ...order import is_worse
 
 SCORES: dict[str, Callable[..., float]] = {
@@ -286,3 +298,204 @@ def test_reliability_counts_every_row_once_in_its_tenth() -> None:
     assert [entry["rows"] for entry in found] == [2, 1, 2]
     assert [entry["held"] for entry in found] == [0.5, 1.0, 0.5]
     assert found[-1]["predicted"] == pytest.approx(0.975)
+
+
+# -- residuals --------------------------------------------------------------------------------------------------------
+
+
+def test_residuals_are_correlated_within_their_segments_at_every_lag_up_to_25() -> None:
+    rng = np.random.default_rng(4)
+    e, u = rng.standard_normal((300, 2)), rng.standard_normal((300, 3))
+    e[7:, 1] += 0.8 * u[:-7, 2]  # the error of roll follows the third input by seven samples
+    e[40, 0] = math.nan
+    segment = np.repeat([0, 1], 150)
+    found = residual_tests(e, u, segment)
+    assert found.lags.tolist() == list(range(LAGS + 1))
+    assert found.cross_lags.tolist() == list(range(-LAGS, LAGS + 1))
+    assert (found.autocorrelation.shape, found.cross_correlation.shape) == ((2, LAGS + 1), (2, 3, 2 * LAGS + 1))
+
+    def by_hand(a: np.ndarray, b: np.ndarray, lag: int) -> float:
+        """Sum of late a times early b over both segments, over their sizes."""
+        pairs = [(k + lag, k) for k in range(300) if 0 <= k + lag < 300 and segment[k + lag] == segment[k]]
+        return sum(a[i] * b[j] for i, j in pairs) / math.sqrt((a @ a) * (b @ b))
+
+    for axis in (0, 1):
+        there = np.isfinite(e[:, axis])
+        own = np.where(there, e[:, axis] - e[there, axis].mean(), 0.0)
+        for lag in (0, 1, LAGS):
+            assert found.autocorrelation[axis, lag] == pytest.approx(by_hand(own, own, lag), rel=1e-9, abs=1e-12)
+        inputs = np.where(there[:, None], u - u[there].mean(axis=0), 0.0)
+        for lag in (-LAGS, -3, 0, 7, LAGS):
+            expected = by_hand(own, inputs[:, 2], lag)
+            assert found.cross_correlation[axis, 2, LAGS + lag] == pytest.approx(expected, rel=1e-9, abs=1e-12)
+        assert found.bound[axis] == pytest.approx(2.5758 / math.sqrt(there.sum()), rel=1e-4)
+    assert int(np.argmax(np.abs(found.cross_correlation[1, 2]))) == LAGS + 7
+    assert not found.uncorrelated
+    # Too few rows say nothing, and that is no pass.
+    few = residual_tests(e[: 2 * LAGS], u[: 2 * LAGS], segment[: 2 * LAGS])
+    assert np.isnan(few.p_value).all()
+    assert not few.white
+    assert not few.uncorrelated
+    assert np.isfinite(
+        residual_tests(e[50 : 51 + 2 * LAGS], u[50 : 51 + 2 * LAGS], segment[50 : 51 + 2 * LAGS]).p_value
+    ).all()
+    table = found.as_dict(("pitch", "roll"))
+    assert table["p_value"] == {"pitch": found.p_value[0], "roll": found.p_value[1]}
+
+
+@pytest.mark.parametrize(
+    ("p", "white"),
+    [((1.0 - LEVEL, 1.0), True), ((1.0, 1.0 - LEVEL - 1e-9), False), ((1.0 - LEVEL - 1e-9, 1.0), False),
+     ((math.nan, 1.0), False), ((1.0, math.nan), False)],
+)  # fmt: skip
+def test_residuals_are_white_where_both_outputs_pass(p: tuple[float, float], white: bool) -> None:
+    none = np.zeros((2, 3, 2 * LAGS + 1))
+    found = ResidualTests(
+        np.arange(26), np.zeros((2, 26)), np.ones(2), np.array(p), np.arange(51), none, np.ones((2, 3))
+    )
+    assert found.white is white
+    assert found.uncorrelated is (not any(math.isnan(value) for value in p))
+    # Causal lags alone count, each output and each input; at the bound itself it passes.
+    for axis, motor, lag, passes in ((0, 0, LAGS, False), (1, 2, 2 * LAGS, False), (1, 1, LAGS - 1, True)):
+        cross = none.copy()
+        cross[axis, motor, lag] = -2.0
+        assert replace(found, p_value=np.ones(2), cross_correlation=cross).uncorrelated is passes
+
+
+def rls() -> Model:
+    return load(ROOT / "tests" / "golden" / "rls.npz")
+
+
+# -- validity, horizons and blocks ------------------------------------------------------------------------------------
+
+
+def test_a_validity_is_judged_against_what_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_error_statistics, "has_validity", lambda _: True)
+    monkeypatch.setattr(_error_statistics, "tolerance_of", lambda _: np.array([0.1, 0.2]))
+    y = np.zeros((6, 2))
+    y[5, 1] = math.nan
+    # Errors within, pitch beyond, roll beyond, at both tolerances, no number, not measured.
+    free = np.array([[0.0, 0.0], [0.11, 0.0], [0.0, 0.21], [0.1, -0.2], [math.nan, 0.0], [0.0, 0.0]])
+    chance = np.array([0.9, 0.4, 0.3, 0.8, 0.2, 0.0])
+    found = judged_validity(None, rows_of(y), np.column_stack([free, np.full(6, 7.0), chance]))  # pyright: ignore[reportArgumentType]
+    assert found is not None
+    held = np.array([1.0, 0.0, 0.0, 1.0, 0.0])
+    assert (found["least"], found["mean"], found["held"]) == (0.2, pytest.approx(0.52), 0.4)
+    assert found["brier"] == pytest.approx(float(np.mean((chance[:5] - held) ** 2)))
+    assert found["brier_base_rate"] == pytest.approx(0.4 * 0.6)
+    nothing = np.column_stack([free, np.full(6, math.nan)])
+    assert judged_validity(None, rows_of(y), nothing) is None  # pyright: ignore[reportArgumentType]
+    assert judged_validity(None, rows_of(y), free) is None  # pyright: ignore[reportArgumentType]
+
+
+def test_blocks_are_of_the_rows_that_are_judged_and_of_every_segment_that_has_some() -> None:
+    table = np.zeros((30, 2))
+    table[2:9, 0], table[3:8, 1] = 1.0, 2.0  # first segment, of ten rows: seven of them are judged
+    table[20:30] = [3.0, 4.0]  # of the second none is, of the third all are
+    found = _block_sums(table, np.repeat([0, 1, 2], 10), 3)
+    assert found.shape == (17, 2)
+    rows = [table[2:9], table[20:30]]
+    expected = [sum(part[(k + i) % len(part)] for i in range(3)) for part in rows for k in range(len(part))]
+    np.testing.assert_allclose(found, expected)
+    assert _block_sums(np.zeros((30, 2)), np.repeat([0, 1, 2], 10), 3).shape == (0, 2)
+
+
+def test_every_row_is_predicted_up_to_75000_steps_and_every_nth_beyond() -> None:
+    def stride(rows: int, horizon: int) -> int:
+        return replace(rows_of(np.zeros((2, 2))), since=np.arange(rows)).stride(horizon)
+
+    assert [stride(75_000, 1), stride(75_001, 1)] == [1, 1]
+    assert [stride(7_510, 10), stride(7_511, 10), stride(15_010, 10), stride(15_011, 10)] == [1, 2, 2, 3]
+    rows = replace(rows_of(np.ones((60_000, 2))), since=np.arange(60_000))
+    kept = np.flatnonzero(np.isfinite(rows.outputs_at(5)).all(axis=1))
+    assert kept.tolist() == list(range(5, 60_000, rows.stride(5)))
+
+
+def test_threads_and_strides_predict_as_one_call_does(
+    models: dict[str, Model], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = neck_recording(120, seed=8)
+    model = rls()
+    whole = model.predict(run, 4)
+    monkeypatch.setattr(_score_tables, "_WORTH_A_THREAD", 0)
+    for workers in (1, 2, 3):
+        monkeypatch.setattr(_score_tables.os, "cpu_count", lambda workers=workers: workers)
+        np.testing.assert_array_equal(_score_tables.predict(model, [run], 4, motors="simulated"), whole)
+        for stride in (2, 7):
+            found = _score_tables.predict(model, [run, run], 4, motors="simulated", stride=stride)
+            for part in (found[:120], found[120:]):
+                rows = np.flatnonzero(np.isfinite(part).all(axis=1))
+                assert rows.tolist() == list(range(4, 120, stride))
+                # The same arithmetic from the same state.
+                np.testing.assert_allclose(part[rows], whole[rows], rtol=1e-9, atol=1e-12)
+
+
+# -- what is judged ---------------------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_judged_is_refused() -> None:
+    model, run = rls(), neck_recording(120, seed=8)
+    blind = replace(run, channels={name: values for name, values in run.channels.items() if "position" not in name})
+    with pytest.raises(DataError, match="needs logged motor positions"):
+        validate(model, blind, motors="measured")
+    mute = {name: np.full(120, math.nan) if name in ("pitch", "roll") else v for name, v in run.channels.items()}
+    with pytest.raises(DataError, match="neither pitch nor roll was ever measured"):
+        validate(model, replace(run, channels=mute))
+    with pytest.raises(DataError, match="a horizon of 120 samples is longer than what is judged"):
+        validate(model, run, horizons=(1, 120, "inf"))
+    assert list(validate(model, run, horizons=(119,)).fits) == ["119"]
+    assert Rules().include_training is False
+    for wrong in (0, -1, 1.5, "far"):
+        with pytest.raises(DataError, match="a horizon is a number of samples"):
+            Rules(horizons=(wrong,))  # pyright: ignore[reportArgumentType]
+
+
+def test_without_a_simulation_there_is_none_and_a_row_with_one_output_is_a_row() -> None:
+    run = neck_recording(120, seed=8)
+    half = run.channels["roll"].copy()
+    half[60:70] = math.nan
+    found = validate(rls(), replace(run, channels={**run.channels, "roll": half}), horizons=(1, 5))
+    assert found.rows_by_horizon == {"1": 95, "5": 95}
+    assert found.calibrated_bounds == {"reason": "there is no simulation, or it diverged"}
+    assert found.cold_fits == {"pitch": None, "roll": None}
+    assert np.isnan(found.free_run).all()
+    assert found.diverged is None
+    whole = validate(rls(), run, horizons=(1, "inf"))
+    assert "1 record(s)" in whole.calibrated_bounds["reason"]
+    assert whole.cold_fits["pitch"] is not None
+
+
+# -- baselines --------------------------------------------------------------------------------------------------------
+
+
+def test_a_missed_sample_is_the_last_one_before_it_in_its_own_output() -> None:
+    y = np.array([[math.nan, 5.0], [1.0, math.nan], [math.nan, 6.0], [2.0, math.nan]])
+    run: Any = SimpleNamespace(outputs=y)
+    held = _baselines.held_outputs(run)
+    np.testing.assert_array_equal(held, [[math.nan, 5.0], [1.0, 5.0], [1.0, 6.0], [2.0, 6.0]])
+    late = _baselines.persistence(run, 2)
+    np.testing.assert_array_equal(late, [*held[[0, 0]], *held[:2]])
+    assert _baselines.persistence(run, 9).shape == (4, 2)
+
+
+def test_the_best_linear_fit_is_of_each_output_on_its_own_rows() -> None:
+    rng = np.random.default_rng(3)
+    X = np.column_stack([np.ones(200), rng.standard_normal((200, 2))])
+    y = X @ np.array([[0.1, 2.0], [1.0, -1.0], [0.5, 0.3]]) + 0.1 * rng.standard_normal((200, 2))
+
+    def alone(axis: int, rows: np.ndarray) -> float:
+        fit = X[rows] @ np.linalg.lstsq(X[rows], y[rows, axis], rcond=None)[0]
+        return nrmse_fit(y[rows, axis], fit)
+
+    every = np.ones(200, dtype=bool)
+    assert _baselines._fits(X, y) == pytest.approx([alone(0, every), alone(1, every)])
+    for axis in (0, 1):
+        gone = y.copy()
+        gone[50:90, axis] = math.nan
+        rows = np.isfinite(gone[:, axis])
+        expected = [alone(0, rows if axis == 0 else every), alone(1, rows if axis == 1 else every)]
+        assert _baselines._fits(X, gone) == pytest.approx(expected)
+    # Ten rows for each of three parameters are the fewest.
+    for rows, known in ((30, True), (29, False)):
+        few = np.where(np.arange(200)[:, None] < rows, y, math.nan)
+        assert [value is not None for value in _baselines._fits(X, few)] == [known] * 2
