@@ -17,7 +17,7 @@ from softneck.drives.logs._result import CycleTimes
 from softneck.drives.master import Frame, MasterSettings, Phase, Tilt
 from softneck.drives.master._cia402 import DriveState
 from softneck.drives.master._events import Event
-from softneck.drives.master._fieldbus import Fieldbus, NodeState
+from softneck.drives.master._fieldbus import Command, Fieldbus, NodeState
 from softneck.drives.master._gate import BAD, DROPOUT, FROZEN, Gate
 from softneck.drives.master._master import Master, Measurement
 from softneck.drives.master._settings import LimitSettings, WatchSettings
@@ -748,6 +748,16 @@ def test_an_emergency_counts_by_its_code_whatever_its_register(code: int, regist
     assert all(event.node == node for event in found)
     assert bus.drives[1].emergencies == [(0.5, code, register)]
     assert bus.drives[0].emergencies == []
+
+
+def test_states_and_commands_have_the_numbers_of_the_standard() -> None:
+    """CiA 301, tables 37 and 38: NMT states in heartbeats, and the command specifiers."""
+    assert {state.name: int(state) for state in NodeState} == {
+        "BOOT_UP": 0x00, "STOPPED": 0x04, "OPERATIONAL": 0x05, "PRE_OPERATIONAL": 0x7F, "UNKNOWN": 0xFF,
+    }  # fmt: skip
+    assert {command.name: int(command) for command in Command} == {
+        "START": 0x01, "STOP": 0x02, "PRE_OPERATIONAL": 0x80, "RESET_NODE": 0x81, "RESET_COMMUNICATION": 0x82,
+    }  # fmt: skip
 
 
 def test_a_short_emergency_is_malformed() -> None:

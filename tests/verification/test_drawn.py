@@ -18,7 +18,7 @@ from softneck.identification.uncertainty import _draws
 from softneck.loop import LoopResult
 from softneck.verification import _drawn, make_requirements, verify
 from softneck.verification._drawn import Drawn, _Margin, certified_content, draws_of, run_drawn
-from softneck.verification._experiments import crossing_values, crossings
+from softneck.verification._experiments import Experiment, LoopUnderTest, crossing_values, crossings
 from softneck.verification._neck_loops import loops_under_test, make_simulation_model
 
 from .necks import COUNT, QUICK, TS, family, pi, small_draws
@@ -407,6 +407,42 @@ def test_the_least_margin_of_a_draw_is_that_of_its_worst_experiment_in_its_unit(
     assert facts["kick_deg"] == pytest.approx(math.degrees(0.5))
     assert facts["posture_deg"] == pytest.approx([math.degrees(0.1), 0.0])
     assert (facts["name"], facts["axis"], facts["raised"], facts["worst_of"]) == ("draw 1", "pitch", "gain_up", 3)
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("number", [0, 1, 2, 5])
+def test_each_axis_is_tried_with_the_lightest_payload_and_all_at_once_with_both(
+    outputs: int, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At every amplitude; what ranks the draws are all axes at once beyond the smallest; postures take turns."""
+    names = ("pitch", "roll")[:outputs]
+    under = LoopUnderTest(name="", plant=lambda: None, controller=pi().block(), size=2.0)  # pyright: ignore[reportArgumentType]
+    monkeypatch.setattr(_drawn, "_under_test", lambda *_: under)
+    monkeypatch.setattr(Experiment, "floor", lambda case: case.amplitude)
+    tried: list[Any] = []
+    monkeypatch.setattr(_drawn, "_at_limit", lambda *args, **more: tried.append((args, more)) or [args[0]])
+    plant: Any = SimpleNamespace(name="draw 3", payload="inputs", payloads=lambda _: [0.5, 0.0, 0.2],
+                                 carrying=lambda kg: {"plant_inputs": kg}, quiet=lambda ts: ("quiet", ts))  # fmt: skip
+    asked: Any = SimpleNamespace(robot=SimpleNamespace(outputs=SimpleNamespace(names=names)), sim={"payloads_kg": []})
+    task: Any = SimpleNamespace(plants=[plant] * 9, asked=asked, draws=None, controller=pi().block(), observer=None,
+                                order="parallel", amplitudes=(0.1, 0.2), limits={"g": 2.0, "d": 40.0})  # fmt: skip
+    found = _drawn._margins(task, number)
+    last = "both" if outputs == 2 else "pitch"
+    light = [*names, last] if outputs == 2 else [last]
+    expected = [
+        (kg, amplitude, axes, limit)
+        for kg, every in ((0.0, light), (0.5, [last])) for amplitude in (0.1, 0.2) for axes in every for limit in "gd"
+    ]  # fmt: skip
+    told = [(case.loop.constants["plant_inputs"], case.amplitude, case.axes, metric)
+            for (case, _, metric, _, _), _ in tried]  # fmt: skip
+    assert told == expected
+    assert len(found) == len(expected)
+    for (case, floor, metric, limit, at), more in tried:
+        assert (floor, limit, at) == (case.amplitude, task.limits[metric], number)
+        assert more == {"whole": case.axes == last, "ranks": case.axes == last and case.amplitude == 0.2}
+        assert case.posture == tuple(2.0 * angle for angle in under.postures()[number % 3])
+        assert (case.loop.order, case.loop.plant()) == ("parallel", ("quiet", TS))
+        assert case.loop.name == f"draw 3, {case.loop.constants['plant_inputs']:g} kg"
 
 
 def test_draws_that_fail_are_bisected_first_and_then_those_that_swing_most() -> None:

@@ -369,6 +369,99 @@ def test_slack_is_judged_wherever_it_is_known(
     assert found.metrics["sim.slack_s"].describe(len(values) - 1) == {"name": f"run {last}"}
 
 
+def test_draws_decide_for_what_they_tell_beside_experiments_on_the_user_s_plants() -> None:
+    def values(*numbers: float, who: str) -> Values:
+        return Values(np.array(numbers), lambda row: {"who": who, "row": row})
+
+    crossing = Crossing("own", "both", "gain_up", 0.02, (0.0, 0.0), 1.3, 0.0)
+    draws = SimpleNamespace(
+        values={"axes.gain_margin": np.array([2.0, 3.0]), "sim.rise_s": np.array([0.5])},
+        conditions={"axes.gain_margin": [{"name": "a"}, {"name": "b"}], "sim.rise_s": [{"name": "c"}]},
+    )
+    before = {"axes.gain_margin": values(9.0, who="linear"), "axes.sensitivity": values(1.1, who="linear"),
+              "sim.rise_s": values(0.4, who="loop")}  # fmt: skip
+    evidence: Any = SimpleNamespace(metrics=dict(before), crossings=[crossing], drawn=[draws])
+    _evidence._add_drawn(evidence, set(draws.values))
+    found = evidence.metrics
+    assert found["axes.gain_margin"].values.tolist() == [1.3, 2.0, 3.0]
+    assert found["axes.gain_margin"].describe(0)["kind"] == "experiment"
+    assert [found["axes.gain_margin"].describe(row) for row in (1, 2)] == [
+        {"kind": "draw", "name": "a"}, {"kind": "draw", "name": "b"},
+    ]  # fmt: skip
+    # Loops over other plants stay beside those of the draws, and what the draws do not tell stays as it was.
+    assert found["sim.rise_s"].values.tolist() == [0.4, 0.5]
+    assert found["axes.sensitivity"] is before["axes.sensitivity"]
+
+
+def test_margins_over_the_recordings_and_by_experiment_are_added_to_their_groups() -> None:
+    part: Any = SimpleNamespace(
+        source="f", axis="roll", band=(1.0, 20.0), margins={"disk_margin": 0.7, "gain_margin": 2.4}, mu=0.9,
+        at={"disk_margin": 5.0, "gain_margin": 6.0, "mu": 7.0},
+    )  # fmt: skip
+    crossing = Crossing("own", "pitch", "delay", 0.02, (0.0, 0.0), 0.05, 0.0)
+    evidence: Any = SimpleNamespace(metrics={}, tested=[part], crossings=[crossing], not_computed={})
+    _evidence._add_data_margins(evidence)
+    table = {name: found.values.tolist() for name, found in evidence.metrics.items()}
+    assert table == {
+        "roll.disk_margin": [0.7], "axes.disk_margin": [0.7], "mimo.disk_margin": [0.7], "roll.gain_margin": [2.4],
+        "axes.gain_margin": [2.4], "robust.mu": [0.9], "pitch.delay_margin_ms": [50.0], "axes.delay_margin_ms": [50.0],
+    }  # fmt: skip
+    facts = evidence.metrics["robust.mu"].describe(0)
+    assert (facts["axis"], facts["frequency_rad_s"], facts["band_rad_s"]) == ("roll", 7.0, [1.0, 20.0])
+    assert evidence.not_computed == {}
+    nothing: Any = SimpleNamespace(metrics={}, tested=[], crossings=[], not_computed={})
+    _evidence._add_data_margins(nothing)
+    assert set(nothing.not_computed) == {"the band of the data", "margins by experiment"}
+
+
+def test_margins_of_each_law_plant_and_search_stand_under_their_axis_and_under_all() -> None:
+    margin_table = {"stability.radius": np.array([0.8, 0.9, 0.95]), "pitch.gain_margin": np.array([3.0, 2.5, 2.0]),
+                    "roll.gain_margin": np.array([4.0, 1.5, 5.0]), "mimo.disk_margin": np.array([0.5, 0.6, 0.7])}  # fmt: skip
+    plants = SimpleNamespace(axes=("pitch", "roll"))
+    rows = [[StructuredResult("pitch", np.array([1.0, 2.0]), np.array([0.3, 0.6]))]]
+    part: Any = SimpleNamespace(name="low", plants=plants, margins=margin_table, structured=rows,
+                                found=SimpleNamespace(radius=0.99))  # fmt: skip
+    evidence: Any = SimpleNamespace(metrics={}, plants=[0, 1])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_evidence, "plant_facts", lambda _, row: {"row": row})
+        _evidence._add_linear_margins(evidence, part)
+        found = evidence.metrics
+        assert found["stability.radius"].values.tolist() == [0.8, 0.9]
+        # The plant of the search, and the largest radius that it met, which the same plant stands for.
+        searched = found["stability.searched_radius"]
+        assert searched.values.tolist() == [0.95, 0.99]
+        assert [searched.describe(k)["row"] for k in (0, 1)] == [2, 2]
+        assert found["axes.gain_margin"].values.tolist() == [3.0, 2.5, 2.0, 4.0, 1.5, 5.0]
+        assert found["axes.gain_margin"].describe(4) == {"row": 1, "axis": "roll", "frozen_point": "low"}
+        assert found["mimo.disk_margin"].describe(1) == {"row": 1, "axis": "both", "frozen_point": "low"}
+        assert found["robust.mu"].describe(0)["frequency_rad_s"] == 2.0
+        assert found["robust.mu"].values.tolist() == [0.6]
+
+
+def test_what_was_not_computed_is_said() -> None:
+    def absent(
+        *, laws: int = 1, observer: bool = False, generations: int = 5, payload: bool = False, name: str = ""
+    ) -> Any:
+        part = SimpleNamespace(name=name)
+        evidence = Evidence(None, None, [part] * laws, SimpleNamespace(metrics={}), None, [])  # pyright: ignore[reportArgumentType]
+        ports = (SimpleNamespace(name="payload"),) if payload else ()
+        controller: Any = SimpleNamespace(why="it has no ss()", block=SimpleNamespace(inputs=ports))
+        asked = make_requirements({"sampling": {"search_generations": generations}})
+        _evidence._fill_metrics(evidence, controller, asked, observer=observer)
+        return {key: why for key, why in evidence.not_computed.items()
+                if key not in ("the band of the data", "margins by experiment")}  # fmt: skip
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_evidence, "_add_linear_margins", lambda *_: None)
+        assert absent() == {}
+        assert absent(laws=0) == dict.fromkeys(("stability", "axes", "mimo", "robust"), "it has no ss()")
+        assert set(absent(observer=True)) == {"observer in the linear checks"}
+        assert set(absent(observer=True, laws=0)) == {"stability", "axes", "mimo", "robust"}
+        assert set(absent(generations=0)) == {"stability.searched_radius"}
+        assert set(absent(payload=True)) == {"steps of other payloads"}
+        assert set(absent(name="low")) == {"stability between frozen points"}
+
+
 def test_further_values_of_a_metric_are_appended_each_with_its_own_facts() -> None:
     evidence: Any = SimpleNamespace(metrics={})
     for start in (0, 2, 5):

@@ -411,9 +411,7 @@ def test_every_row_is_predicted_up_to_75000_steps_and_every_nth_beyond() -> None
     assert kept.tolist() == list(range(5, 60_000, rows.stride(5)))
 
 
-def test_threads_and_strides_predict_as_one_call_does(
-    models: dict[str, Model], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_threads_and_strides_predict_as_one_call_does(monkeypatch: pytest.MonkeyPatch) -> None:
     run = neck_recording(120, seed=8)
     model = rls()
     whole = model.predict(run, 4)
