@@ -17,8 +17,9 @@ from softneck.drives.logs._result import CycleTimes
 from softneck.drives.master import Frame, MasterSettings, Phase, Tilt
 from softneck.drives.master._cia402 import DriveState
 from softneck.drives.master._events import Event
-from softneck.drives.master._fieldbus import Command, Fieldbus, NodeState
+from softneck.drives.master._fieldbus import Fieldbus, NodeState
 from softneck.drives.master._gate import BAD, DROPOUT, FROZEN, Gate
+from softneck.drives.master._limiter import Limiter
 from softneck.drives.master._master import Master, Measurement
 from softneck.drives.master._settings import LimitSettings, WatchSettings
 from softneck.drives.master._watches import Watches, timing
@@ -750,14 +751,67 @@ def test_an_emergency_counts_by_its_code_whatever_its_register(code: int, regist
     assert bus.drives[0].emergencies == []
 
 
-def test_states_and_commands_have_the_numbers_of_the_standard() -> None:
-    """CiA 301, tables 37 and 38: NMT states in heartbeats, and the command specifiers."""
-    assert {state.name: int(state) for state in NodeState} == {
-        "BOOT_UP": 0x00, "STOPPED": 0x04, "OPERATIONAL": 0x05, "PRE_OPERATIONAL": 0x7F, "UNKNOWN": 0xFF,
-    }  # fmt: skip
-    assert {command.name: int(command) for command in Command} == {
-        "START": 0x01, "STOP": 0x02, "PRE_OPERATIONAL": 0x80, "RESET_NODE": 0x81, "RESET_COMMUNICATION": 0x82,
-    }  # fmt: skip
+def test_the_mode_is_taken_only_by_a_drive_that_was_asked() -> None:
+    bus = Fieldbus(MasterSettings(counts_per_radian=(1.0,) * 3).bus)
+    taken, refused = b"\x60\x60\x60\0\0\0\0\0", b"\x80\x60\x60\0\0\0\0\0"
+    for mode, data, then in (("asked", taken, "taken"), ("asked", refused, "asked"), ("missing", taken, "missing")):
+        view = bus.drives[1]
+        view.mode = mode
+        bus._answer(0.0, view, data, [])
+        assert view.mode == then
+
+
+@pytest.mark.parametrize("phase", [Phase.RAMP_IN, Phase.RAMP_OUT, Phase.RETREAT])
+def test_a_ramp_that_does_not_arrive_in_its_time_is_told(phase: Phase) -> None:
+    """30 s; without a sensor the way from the farthest set-point: 6 rad at 1 rad/s, one to settle and one more."""
+    most = 8.0 if phase is Phase.RETREAT else 30.0
+    for after, told in ((most - 0.01, []), (most + 0.01, ["ramp_timeout"])):
+        master, events = _master(Pilot()), list[Event]()
+        master.supervisor.phase, master.supervisor.since, master.setpoints = phase, 100.0, (0.0, 5.0, 0.0)
+        master._ramp(100.0 + after, events)
+        assert [event.name for event in events] == told
+
+
+@pytest.mark.parametrize("motor", [0, 1, 2])
+def test_a_ramp_arrives_where_every_motor_is_at_rest_long_enough_and_at_a_sample(motor: int) -> None:
+    ramps = MasterSettings(counts_per_radian=(1.0,) * 3).ramps
+    for position, there in ((0.999 * ramps.tolerance, True), (-0.999 * ramps.tolerance, True), (ramps.tolerance, False),
+                            (-1.001 * ramps.tolerance, False), (math.nan, False)):  # fmt: skip
+        master = _master(Pilot())
+        master.supervisor.phase = Phase.RAMP_IN
+        positions = [0.0, 0.0, 0.0]
+        positions[motor] = position
+        master.positions = tuple(positions)
+        master.cycle = 0
+        master._ramp(50.0, [])
+        master._ramp(50.0 + ramps.settle - 0.001, [])
+        assert master.supervisor.phase is Phase.RAMP_IN
+        # Two cycles make a sample: the run starts with one.
+        master._ramp(50.0 + ramps.settle, [])
+        assert master.supervisor.phase is Phase.RAMP_IN
+        master.cycle = 1
+        master._ramp(50.0 + ramps.settle, [])
+        assert (master.supervisor.phase is Phase.RUNNING) is there
+
+
+def test_a_drive_that_never_answers_is_missed_from_the_first_step_on() -> None:
+    master = _master(Pilot())
+    wait = master.settings.bus.answer_time
+    master._timing(20.0)
+    assert [view.answered for view in master.bus.drives] == [20.0] * 3
+    for now, missed in ((20.0 + wait - 0.001, 0), (20.0 + wait + 0.001, 3)):
+        events: list[Event] = []
+        master.bus._watch(now, events)
+        assert [event.name for event in events].count("heartbeat_missing") == missed
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_set_point_beyond_the_range_goes_to_its_near_end(sign: float) -> None:
+    limiter = Limiter(LimitSettings(position=6.0), 0.01)
+    for _ in range(2000):
+        limiter.step(sign * 100.0, 1.0)
+    assert limiter.value == pytest.approx(sign * 6.0)
+    assert limiter.clamped == "position"
 
 
 def test_a_short_emergency_is_malformed() -> None:

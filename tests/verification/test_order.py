@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softneck.core import DataError, metric_of
+from softneck.core import DataError, SettingsError, metric_of
 from softneck.loop import LoopResult
 from softneck.robot import Robot
 from softneck.verification import (
@@ -30,7 +31,7 @@ from softneck.verification._experiments import Crossing, crossing_values
 from softneck.verification._linear import LARGE, SMALL, LinearLaw, margins
 from softneck.verification._metrics import Scale
 from softneck.verification._neck_loops import LoopRun, judge_loop
-from softneck.verification._plants import nominal_plants, source_of_family
+from softneck.verification._plants import all_plants, nominal_plants, source_of_family
 from softneck.verification._requirements import Requirement, make_requirements
 from softneck.verification._steps import StepTest, _metrics, run_steps
 from softneck.verification._structured import StructuredResult, _Task
@@ -415,8 +416,12 @@ def test_margins_over_the_recordings_and_by_experiment_are_added_to_their_groups
 
 
 def test_margins_of_each_law_plant_and_search_stand_under_their_axis_and_under_all() -> None:
-    margin_table = {"stability.radius": np.array([0.8, 0.9, 0.95]), "pitch.gain_margin": np.array([3.0, 2.5, 2.0]),
-                    "roll.gain_margin": np.array([4.0, 1.5, 5.0]), "mimo.disk_margin": np.array([0.5, 0.6, 0.7])}  # fmt: skip
+    margin_table = {
+        "stability.radius": np.array([0.8, 0.9, 0.95]),
+        "pitch.gain_margin": np.array([3.0, 2.5, 2.0]),
+        "roll.gain_margin": np.array([4.0, 1.5, 5.0]),
+        "mimo.disk_margin": np.array([0.5, 0.6, 0.7]),
+    }
     plants = SimpleNamespace(axes=("pitch", "roll"))
     rows = [[StructuredResult("pitch", np.array([1.0, 2.0]), np.array([0.3, 0.6]))]]
     part: Any = SimpleNamespace(name="low", plants=plants, margins=margin_table, structured=rows,
@@ -469,6 +474,180 @@ def test_further_values_of_a_metric_are_appended_each_with_its_own_facts() -> No
     found = evidence.metrics["m"]
     assert found.values.tolist() == [0.0, 1.0, 2.0, 3.0, 5.0, 6.0]
     assert [found.describe(row)["row"] for row in range(6)] == [0, 1, 2, 3, 5, 6]
+
+
+# -- controllers, plants and their conditions -------------------------------------------------------------------------
+
+
+def _controller(**more: Any) -> Any:
+    block = SimpleNamespace(role="controller", kind="own", sample_time=TS)
+    return SimpleNamespace(block=lambda: block, robot=Robot.preset(), **more)
+
+
+@pytest.mark.parametrize(
+    ("designed", "asked", "design", "observer", "extra"),
+    [
+        ("sequential", None, {}, True, 0), ("jacobi", "sequential", {"extra_delay": 5}, False, 0),
+        ("jacobi", None, {"extra_delay": 5}, False, 5), ("jacobi", "jacobi", {}, False, 1),
+        ("jacobi", None, {}, True, 2), ("sequential", "jacobi", {"extra_delay": 5}, True, 2),
+    ],
+)  # fmt: skip
+def test_the_delay_that_an_order_adds_is_the_design_s_or_a_sample_for_each_part(
+    designed: str, asked: str | None, design: dict[str, int], observer: bool, extra: int
+) -> None:
+    found = _linear.controller_under_test(_controller(order=designed, design=design), order=asked, observer=observer)
+    assert (found.extra, found.order) == (extra, asked or designed)
+    assert found.laws == {}
+    assert "own has no linear form" in found.why
+
+
+def test_a_controller_is_linear_by_its_form_or_at_its_points() -> None:
+    form = CONTROLLER().ss()
+    for name in ("ss", "to_lti"):
+        assert list(_linear._laws(_controller(**{name: lambda: form}))[0]) == [""]
+    points = {"low": 0.0, "high": 1.0}
+    both = _controller(ss_at=lambda point: form if point in (0.0, 1.0) else None, points=lambda: points)
+    assert list(_linear._laws(both)[0]) == ["low", "high"]
+    for half in (_controller(ss_at=lambda _: form), _controller(points=lambda: points)):
+        laws, why = _linear._laws(half)
+        assert (laws, "no linear form" in why) == ({}, True)
+    for wrong in (SimpleNamespace(), SimpleNamespace(block=lambda: SimpleNamespace(role="plant", kind="p"))):
+        with pytest.raises(SettingsError, match="a controller is needed"):
+            _linear.controller_under_test(wrong, order=None, observer=False)
+
+
+def test_the_radius_of_a_loop_is_that_of_its_slowest_pole() -> None:
+    plants = all_plants([source_of_family(family(), "f")], 30, 0)
+    law = LinearLaw.of(CONTROLLER().ss(), Robot.preset())
+    expected = np.abs(_linear.closed_poles(plants, law)).max(axis=1)
+    np.testing.assert_array_equal(margins(plants, law)["stability.radius"], expected)
+    assert (expected > np.abs(_linear.closed_poles(plants, law)).min(axis=1)).all()
+
+
+def test_samples_that_a_family_did_not_use_are_no_plants() -> None:
+    whole = family()
+    axis = replace(whole.axes["roll"], used=np.array([1.0, 0.0, 0.6, 0.5, 1.0, 0.0]))
+    source = source_of_family(replace(whole, axes={**whole.axes, "roll": axis}), "f")
+    np.testing.assert_array_equal(source.axes[1].samples, whole.axes["roll"].samples[[0, 2, 4]])
+    assert source.axes[1].std.shape == (3, 3)
+    assert source.axes[0].samples.shape == (6, 3)
+    none = replace(whole, axes={**whole.axes, "roll": replace(axis, used=np.zeros(6))})
+    with pytest.raises(SettingsError, match="f: the family has no samples of roll"):
+        source_of_family(none, "f")
+
+
+@pytest.mark.parametrize("payload", ["inputs", ""])
+def test_margins_by_experiment_are_of_each_axis_lightly_loaded_and_of_all_with_the_heaviest(payload: str) -> None:
+    plant: Any = SimpleNamespace(name="own", payload=payload, payloads=lambda kg: sorted(kg) if payload else [0.0],
+                                 quiet=lambda ts: ("quiet", ts), carrying=lambda kg: {"kg": kg})  # fmt: skip
+    asked = make_requirements({"sim": {"payloads_kg": [0.5, 0.0, 1.0]}})
+    block: Any = SimpleNamespace(sample_time=TS)
+    loops = _neck_loops.loops_under_test(block, [plant], asked, order="parallel", observer=None)
+    told = [(loop.name, loop.axes, loop.constants) for loop in loops]
+    light = ("own, 0 kg" if payload else "own", ("pitch", "roll", "both"), {"kg": 0.0})
+    assert told == ([light, ("own, 1 kg", ("both",), {"kg": 1.0})] if payload else [light])
+    assert all((loop.order, loop.plant()) == ("parallel", ("quiet", TS)) for loop in loops)
+
+
+def test_each_loop_has_a_payload_a_direction_and_a_noise_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Asked and judged: payloads and directions as they stand in the table, the size in both shares."""
+    monkeypatch.setattr(_neck_loops, "step_loop", lambda *args, **more: (args, more))
+    monkeypatch.setattr(_neck_loops, "judge_loop", lambda loop: ({"rise_s": 1.0}, loop))
+    plant: Any = SimpleNamespace(name="own", payload="inputs", parameters=None, payloads=lambda kg: sorted(kg),
+                                 make=lambda seed, ts: (seed, ts))  # fmt: skip
+    asked = make_requirements({"sim": {"payloads_kg": [0.5, 0.0], "orientations_deg": [0.0, 90.0], "size_deg": 10.0}})
+    block: Any = SimpleNamespace(sample_time=TS, parameters=())
+    shares: list[float] = []
+    runs = _neck_loops.run_loops(block, asked, order="sequential", observer=None, seed=40,
+                                 progress=lambda share, _: shares.append(share), own=[plant])  # fmt: skip
+    told = [(run.name, run.payload, round(math.degrees(run.orientation)), run.seed) for run in runs]
+    assert told == [("own, 0 kg, 0 deg", 0.0, 0, 40), ("own, 0 kg, 90 deg", 0.0, 90, 41),
+                    ("own, 0.5 kg, 0 deg", 0.5, 0, 42), ("own, 0.5 kg, 90 deg", 0.5, 90, 43)]  # fmt: skip
+    results: list[Any] = [run.result for run in runs]
+    assert [args[1] for args, _ in results] == [(seed, TS) for seed in (40, 41, 42, 43)]
+    ends = [args[4].values for args, _ in results[:2]]
+    size = math.radians(10.0)
+    assert ends == [pytest.approx((size, 0.0), abs=1e-12), pytest.approx((0.0, size), abs=1e-12)]
+    assert [more["duration"] for _, more in results] == [5.5] * 4
+    assert shares == [0.0, 0.25, 0.5, 0.75]
+
+
+def test_what_steps_is_a_simulation_model_and_what_has_a_linear_form_is_none() -> None:
+    form = SimpleNamespace(tf=lambda name: name, robot=Robot.preset(), block=None)
+
+    def fails(name: str) -> Any:
+        raise SettingsError(name)
+
+    nonlinear = SimpleNamespace(tf=fails, robot=Robot.preset(), block=None)
+    found = [
+        _neck_loops.is_simulation_model(thing)
+        for thing in (
+            form,
+            nonlinear,
+            SimpleNamespace(tf=fails, robot=Robot.preset()),
+            SimpleNamespace(block=None),
+            int,
+            5,
+        )
+    ]
+    assert found == [False, True, False, True, True, False]
+
+
+def test_a_robot_without_a_virtual_plant_says_why_unless_one_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any) -> Any:
+        raise SettingsError("no tendons")
+
+    monkeypatch.setattr(_neck_loops, "virtual_plant", fails)
+    neck, arm = Robot.preset(), Robot.preset("arm")
+    quiet = make_requirements({"sim": {"necks": 0}}, robot=arm)
+    assert "switched off" in _neck_loops.why_no_virtual_plant(arm, quiet)
+    bare = replace(arm, neck=None)
+    assert "no virtual plant stands for" in _neck_loops.why_no_virtual_plant(bare, make_requirements({}, robot=bare))
+    for robot, table in ((neck, {}), (bare, {"sim": {"preset": "paper"}})):
+        with pytest.raises(SettingsError, match="no tendons"):
+            _neck_loops.why_no_virtual_plant(robot, make_requirements(table, robot=robot))
+    plant: Any = SimpleNamespace(robot=neck, parameters=SimpleNamespace(sample=lambda *_, **__: None))
+    monkeypatch.setattr(_neck_loops, "VirtualNeck", fails)
+    with pytest.raises(SettingsError, match="no random neck within a spread of"):
+        _neck_loops._sample_neck(plant, np.random.default_rng(0), 0.1)
+
+
+@pytest.mark.parametrize("what", ["gain_up", "gain_down", "delay"])
+@pytest.mark.parametrize("coarse", [True, False])
+def test_a_scan_begins_where_nothing_is_raised_and_ends_at_its_first_oscillation(what: str, coarse: bool) -> None:
+    none, unit = (0.0, 3 * TS) if what == "delay" else (1.0, 1.0)
+    tried: list[float] = []
+
+    class Case:
+        def __init__(self, ends: float) -> None:
+            self.what, self.ends, self.sample_time = what, ends, TS
+            self.loop = SimpleNamespace(samples=3)
+
+        def oscillates(self, value: float, floor: float) -> bool:
+            assert floor == 0.5
+            tried.append(value)
+            return value >= self.ends
+
+    def crossing(ends: float, least: float = math.inf) -> float:
+        tried.clear()
+        return _experiments._first_crossing(Case(ends), 0.5, least, coarse)  # pyright: ignore[reportArgumentType]
+
+    # Below the first scanned value: none is calm but no change at all.
+    first = unit if what == "delay" else 2.0 ** (0.5 if coarse or what == "gain_down" else 0.25)
+    assert crossing(none) == none
+    assert tried[0] == pytest.approx(first)
+    ends = 2.5 * unit if what == "delay" else 2.6
+    found = crossing(ends)
+    assert found == (
+        pytest.approx(2.0 * unit if what == "delay" else 2.0) if coarse else pytest.approx(ends, rel=0.006)
+    )
+    assert crossing(99.0) == math.inf
+    last = 32.0 * unit if what == "delay" else 4.0 if what == "gain_down" else 16.0
+    assert max(tried) == pytest.approx(last)
+    # An earlier crossing ends a scan: there and not beyond.
+    bound = 2.2 * unit if what == "delay" else 2.2
+    assert crossing(99.0, bound) == math.inf
+    assert max(tried) == bound
 
 
 # -- margins ----------------------------------------------------------------------------------------------------------
