@@ -22,7 +22,7 @@ from softneck.drives.master._gate import BAD, DROPOUT, FROZEN, Gate
 from softneck.drives.master._limiter import Limiter
 from softneck.drives.master._master import Master, Measurement
 from softneck.drives.master._settings import LimitSettings, WatchSettings
-from softneck.drives.master._watches import Watches, timing
+from softneck.drives.master._watches import Patience, Watches, timing
 from softneck.drives.running import _bus_loop, _certified, _preflight, _stop
 from softneck.drives.running._bus_loop import RunEnd, Session
 from softneck.drives.running._certified import SAME, _as_strict, require_same_again
@@ -792,6 +792,49 @@ def test_a_ramp_arrives_where_every_motor_is_at_rest_long_enough_and_at_a_sample
         master.cycle = 1
         master._ramp(50.0 + ramps.settle, [])
         assert (master.supervisor.phase is Phase.RUNNING) is there
+
+
+def test_a_condition_is_reported_once_it_lasted_for_its_time_and_begins_anew_after_a_gap() -> None:
+    patience = Patience(0.2)
+    told = [patience.over(1.0 + 0.1 * k, k != 4) for k in range(8)]
+    assert told == [False, False, True, True, False, False, False, True]
+
+
+def test_a_run_begins_without_a_missing_set_point_and_an_error_has_its_time() -> None:
+    master = _master(Pilot(start=ValueError("no")))
+    master._missing, master._index, master._now = 3, 7, 42.0
+    master.setpoints = (1.0, 2.0, 3.0)
+    master._begin()
+    assert (master._missing, master._index, master.wanted) == (0, -1, (1.0, 2.0, 3.0))
+    assert master.supervisor.fault is not None
+    assert (master.supervisor.fault.name, master.supervisor.fault.time) == ("controller_failed", 42.0)
+
+
+@pytest.mark.parametrize("motor", [-1, 0, 2])
+@pytest.mark.parametrize("at", ["cycle", "sample", ""])
+def test_what_the_charts_find_is_told_of_its_drive(motor: int, at: str) -> None:
+    found = SimpleNamespace(name="friction_changed", motor=motor, detail="x")
+    asked: list[Any] = []
+    charts = SimpleNamespace(
+        cycle=lambda *given: asked.append(given) or (found if at == "cycle" else None),
+        sample=lambda *given: asked.append(given) or (found if at == "sample" else None), rests="",
+    )  # fmt: skip
+    watches = Watches(WatchSettings(), LimitSettings())
+    watches._plausible = charts  # pyright: ignore[reportAttributeAccessIssue]
+    for due, sample in ((False, None), (True, None), (True, Tilt(0.1, 0.2, 0.3, 0.4))):
+        events: list[Event] = []
+        asked.clear()
+        watches.plausible(1.0, (4, 5, 6), (1.0,), (2.0,), (3.0,), events, due=due, sample=sample, reference=(9.0,))
+        told = at == "cycle" or (at == "sample" and due)
+        expected = [("friction_changed", 0 if motor < 0 else (4, 5, 6)[motor], "x")] * told
+        assert [(event.name, event.node, event.detail) for event in events] == expected
+        seen = [((1.0,), (2.0,), (3.0,))]
+        if due and at != "cycle":
+            seen.append(((2.0,), None, (), (9.0,)) if sample is None else ((2.0,), (0.1, 0.2), (0.3, 0.4), (9.0,)))  # pyright: ignore[reportArgumentType]
+        assert asked == seen
+    charts.rests = "at its limit"
+    watches.plausible(1.0, (4, 5, 6), (1.0,), (2.0,), (3.0,), events := [], due=True, sample=None, reference=())
+    assert ("not_watched" in [event.name for event in events]) is (at != "cycle")
 
 
 def test_a_drive_that_never_answers_is_missed_from_the_first_step_on() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -26,7 +27,7 @@ from softneck.verification._plants import (
 )
 from softneck.verification._requirements import Requirement, apply_safety_margin, expand_metrics, select_for_verify
 from softneck.verification._steps import StepTest, _metrics, run_steps
-from softneck.verification._verify import to_json
+from softneck.verification._verify import sources_of, to_json
 
 from .necks import TS, controller_of, family, linear_neck, pi
 
@@ -272,6 +273,41 @@ def test_limits_of_a_robot_scale_by_time_size_load_and_noise_each_where_it_belon
     unknown = make_requirements({}, scale=Scale(known=False))
     assert unknown.at(Scale(time=9.0)).scale.time == 9.0
     assert asked.at(other).scale is other
+
+
+def test_numbers_of_another_robot_have_the_ranges_of_the_neck_s_by_its_scale() -> None:
+    """Where neither robot nor plants give the scale, a size must be positive, and a load any number."""
+    robot = Robot.preset("finger")
+    known = Scale(robot=robot, time=2.0, size=3.0, load=4.0, noise=2.0, known=True)
+    unit = known.name_of("size_deg").rpartition("_")[2]
+    for key, low, high in ((f"size_{unit}", 0.03, 135.0), ("duration_s", 2e-3, 2e6), (f"noise_{unit}", 0.0, 30.0)):
+        free = {"step.settling_s": False}
+        for value in (low, high):
+            assert make_requirements({"step": {key: value}, "require": free}, scale=known).bounds
+        for wrong in (low - 1e-3, high * 1.001):
+            with pytest.raises(SettingsError):
+                make_requirements({"step": {key: wrong}, "require": free}, scale=known)
+    unknown = replace(known, known=False)
+    load = known.name_of("load_rad")
+    assert make_requirements({"step": {f"size_{unit}": 1e9, load: -1e9}}, scale=unknown).bounds
+    with pytest.raises(SettingsError):
+        make_requirements({"step": {f"size_{unit}": -1.0}}, scale=unknown)
+    with pytest.raises(SettingsError):
+        make_requirements({"step": {load: -24.1}}, scale=known)
+
+
+def test_a_model_without_requirements_is_certain_and_what_is_no_plant_is_refused() -> None:
+    [source] = sources_of({"m": linear_neck()})
+    for box in source.axes:
+        np.testing.assert_array_equal(box.low, box.nominal)
+        np.testing.assert_array_equal(box.high, box.nominal)
+    [wide] = sources_of({"m": linear_neck()}, make_requirements({"uncertainty": {"gain_pct": 10.0, "delay_ms": 40.0}}))
+    assert wide.axes[0].high[0] == pytest.approx(1.1 * wide.axes[0].nominal[0])
+    assert wide.axes[0].high[1] == pytest.approx(1.2 * wide.axes[0].nominal[1])
+    assert wide.axes[0].high[2] == pytest.approx(0.04 + wide.axes[0].nominal[2])
+    for things in ({}, {"x": object()}):
+        with pytest.raises(SettingsError):
+            sources_of(things)
 
 
 def test_json_values_of_everything_and_nothing_else() -> None:
