@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from markupsafe import Markup
 
 from softneck import cosim, drives, plots, signals
 from softneck.core import (
@@ -16,7 +15,6 @@ from softneck.core import (
     SoftneckError,
     atomic_write,
     refuse_existing,
-    to_si,
     write_certificate,
 )
 
@@ -101,6 +99,9 @@ def command(
             f"{loop_file}: has no [limits], so a certificate would show nothing; state some, such as "
             f'"pitch.overshoot_pct" = {LOOP["overshoot_pct"]}.'
         )
+    from softneck.report import fault_values, loop_decision, loop_page
+
+    faults = fault_values(setup.loop.faults)
     with progress("simulate", quiet=as_json) as report:
         result = cosim.run_setup(setup, report=lambda done: report(done, loop_file.name))
     for remark in result.remarks:
@@ -111,9 +112,9 @@ def command(
     if view is not None:
         plots.write_page(view, plots.neck_view(result.recording(), title=f"Loop {loop_file.stem}"), force=force)
     if html is not None:
-        plots.write_page(html, _page(loop_file.stem, result, view), force=force)
+        plots.write_page(html, loop_page(loop_file.stem, result, faults=faults, view=view), force=force)
     if as_json:
-        print_json(result.report())
+        print_json({**result.report(), "faults": faults, "decision": loop_decision(result.limits)})
     else:
         _print(path, result)
     failed = [row["metric"] for row in result.limits if not row["holds"]]
@@ -163,49 +164,6 @@ def _limits(result: cosim.Result) -> tuple[list[str], list[list[str]]]:
         value = "-" if row["value"] is None else f"{row['value']:.3f}"
         rows.append([row["metric"], f"{row['limit']:.4g}", value, "holds" if row["holds"] else "fails"])
     return ["metric", "limit", "value", "verdict"], rows
-
-
-def _page(name: str, result: cosim.Result, view: Path | None) -> str:
-
-    tables = [plots.Table("Metrics", *_metrics(result))]
-    if result.limits:
-        tables.insert(0, plots.Table("Limits", *_limits(result)))
-    chart = plots.loop_chart(
-        result.signals.time, result.signals.signals, "Reference, outputs and motors", limits=result.bounds,
-        robot=result.robot,
-    )  # fmt: skip
-    what = "angle" if to_si(result.robot.outputs.unit)[1] == "rad" else "output"
-    words = (
-        f"Order {result.order}, metrics of the {result.angle} {what}, {result.real_time_factor:.0f} times real time."
-    )
-    method = [words]
-    if view is not None:
-        method.append(Markup('<a href="{}">The robot in 3-D</a>').format(view.name))
-    else:
-        method.append(plots.why_not_drawn(result.robot))
-    return plots.page(
-        "Closed loop" if name == "loop" else f"Closed loop: {name.replace('_', ' ')}",
-        [plots.Section("Response", charts=[chart], tables=tables, method=method)],
-        verdict=_verdict(result), holds=result.holds if result.limits else None, footer="Written by softneck simulate.",
-    )  # fmt: skip
-
-
-def _verdict(result: cosim.Result) -> str:
-    """Return in one sentence whether the loop keeps its limits, and which it breaks."""
-    rows = result.limits
-    broken = [f"{row['metric']} is {_value(row)}, limit {row['limit']:.4g}" for row in rows if not row["holds"]]
-    if broken:
-        return f"{len(broken)} of {len(rows)} limits broken: {'; '.join(broken)}."
-    if not rows:
-        return "The loop file states no limits, so nothing was judged."
-    upper = [row for row in rows if row["metric"] != "validity.min" and row["limit"]] or rows
-    nearest = max(upper, key=lambda row: row["value"] / row["limit"])
-    hold = f"All {len(rows)} limits hold; nearest" if len(rows) > 1 else "The limit holds"
-    return f"{hold}: {nearest['metric']}, {_value(nearest)} of {nearest['limit']:.4g}."
-
-
-def _value(row: dict[str, Any]) -> str:
-    return "not reached" if row["value"] is None else f"{row['value']:.3g}"
 
 
 def replay_log(log: Path, *, as_json: bool) -> None:

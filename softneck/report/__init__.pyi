@@ -21,6 +21,9 @@ from ._demo import Demo as Demo
 from ._demo import fit_rows as fit_rows
 from ._demo import fmu_rows as fmu_rows
 from ._demo import loop_rows as loop_rows
+from ._loop_page import fault_values as fault_values
+from ._loop_page import loop_decision as loop_decision
+from ._loop_page import loop_page as loop_page
 from ._project import Project as Project
 from ._project import decision_values as decision_values
 from ._reproduce import LINEAR_HEAD as LINEAR_HEAD

@@ -159,7 +159,8 @@ def test_a_project_on_one_page(call: Call, whole: Path, browser: Browser) -> Non
     with shown(browser, page) as view:
         assert view.complaints == []
         assert [url for url in view.requests if not url.startswith(("file:", "data:", "blob:"))] == []
-        dead = "[...document.querySelectorAll('a')].filter(a => !document.querySelector(a.getAttribute('href'))).length"
+        inside = "[...document.querySelectorAll('nav a')]"
+        dead = f"{inside}.filter(a => !document.querySelector(a.getAttribute('href'))).length"
         assert view.page.evaluate("document.querySelectorAll('nav a').length") >= 10
         assert view.page.evaluate(dead) == 0
         charts = view.page.evaluate("document.querySelectorAll('.chart').length")
