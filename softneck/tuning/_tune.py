@@ -42,7 +42,7 @@ from softneck.verification import (
     with_robot,
 )
 
-from ._judge import LEVELS, design_candidate, loop_of, make_observer, prepare, told_conditions
+from ._judge import LEVELS, design_candidate, keep_worse, loop_of, make_observer, prepare, told_conditions
 from ._requirements import (
     USUAL_RISE,
     TuneRequirements,
@@ -459,12 +459,11 @@ def holds_with_observer(task: Task, item: Candidate, observer: Any, bounds: tupl
     try:
         for case in (case for case in ready.all if not case.circle and not case.late and case.part == 1.0):
             loop = loop_of(case, ready.own[case.plant], block, order, task, eyes)
-            worst |= _worst(worst, judge_loop(loop)[0])
+            for name, value in judge_loop(loop)[0].items():
+                # Without tension outputs there is no slack to know.
+                if name != "slack_s" or not math.isnan(value):
+                    keep_worse(worst, name, value)
     except SoftneckError:
         return False
     named = {f"sim.{task.asked.certificate.scale.name_of(name)}": value for name, value in worst.items()}
     return bool(named) and all(ratio(b, named[b.metric]) <= 1.0 for b in bounds if b.metric in named)
-
-
-def _worst(before: Mapping[str, float], values: Mapping[str, float]) -> dict[str, float]:
-    return {name: max(value, before.get(name, -math.inf)) for name, value in values.items() if not math.isnan(value)}

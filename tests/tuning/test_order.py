@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from softneck.core import KINDS, DataError, SettingsError, metric_of, resolve
-from softneck.loop import LoopResult
+from softneck.core import KINDS, CheckFailedError, DataError, SettingsError, metric_of, resolve
+from softneck.loop import LoopResult, RobotReference
 from softneck.robot import Robot
-from softneck.tuning import _judge, _search
+from softneck.tuning import _judge, _search, _tune, task_of
 from softneck.tuning._judge import (
     LEVELS,
     Case,
@@ -38,6 +39,7 @@ from softneck.verification._linear import AxisMargins
 from softneck.verification._requirements import Requirement
 
 from ..order import MEMBERS, check_worst, is_worse
+from ..verification.necks import family, linear_neck
 
 TS = 0.02
 ALL = metric_names(Robot.preset(), track=True)
@@ -453,7 +455,8 @@ def test_curves_are_of_the_plain_steps_from_the_lowest_to_the_highest(monkeypatc
     run: list[Case] = []
 
     def result(loop: Any, *, compiled: bool) -> LoopResult:
-        run.append(loop)
+        run.append(loop.case)
+        loop = loop.case
         if loop.circle:
             return _circle(2 + loop.plant)
         t = np.arange(300) * TS
@@ -462,7 +465,8 @@ def test_curves_are_of_the_plain_steps_from_the_lowest_to_the_highest(monkeypatc
         signals = {"pitch": size * on, "roll": 9.0 * on, "pitch_reference": 0.2 * on, "roll_reference": 0.0 * on}
         return LoopResult(t, signals | {f"motor_setpoint_{j}": j * on for j in (1, 2, 3)}, {}, TS)
 
-    monkeypatch.setattr(_judge, "loop_of", lambda case, *_: case)
+    still = RobotReference(kind="step", values=(0.2, 0.0), at=0.5)
+    monkeypatch.setattr(_judge, "loop_of", lambda case, *_: SimpleNamespace(case=case, reference=still))
     monkeypatch.setattr(_judge, "run_loop", result)
 
     def curves(cases: list[Case]) -> dict[str, list[float]]:
@@ -708,3 +712,170 @@ def test_a_search_judges_starts_generations_neighbours_and_finals_within_its_bud
     assert ("refine", levels, finals) in said
     # Margins by experiment of the best that were judged as far as any; they may take all that is left.
     assert (said[-1] == ("margins", finals, 0)) is bool(finals)
+
+
+# -- the end of a search ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lost", [None, math.nan, math.inf, 1.01])
+@pytest.mark.parametrize("at", [0, 1])
+def test_a_step_over_an_observer_holds_where_every_loop_of_full_size_does(
+    lost: float | None, at: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    every = [Case(0, 0.0), Case(1, 0.0, noise=True), Case(0, 0.0, part=0.3), Case(0, 0.0, late=True),
+             Case(0, 0.0, circle=True)]  # fmt: skip
+    task = task_for({})
+    ready: Any = SimpleNamespace(all=every, own=[0, 1])
+    controller = SimpleNamespace(block=lambda: None, order="parallel")
+    run: list[Any] = []
+
+    def judged(loop: Any) -> tuple[dict[str, float], None]:
+        run.append(loop)
+        value = lost if lost is not None and len(run) - 1 == at else 1.0
+        return {"rise_s": value, "slack_s": math.nan}, None
+
+    monkeypatch.setattr(_tune, "prepare", lambda _: ready)
+    monkeypatch.setattr(_tune, "design_candidate", lambda *_: controller)
+    monkeypatch.setattr(_tune, "loop_of", lambda *args: (*args[:2], args[3], args[5]))
+    monkeypatch.setattr(_tune, "judge_loop", judged)
+    bounds = (Requirement("sim.rise_s", "max", 1.0, True), Requirement("sim.slack_s", "max", 0.1, False))
+    observer = SimpleNamespace(block=lambda: "eyes")
+    held = _tune.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, bounds)
+    assert held is (lost is None)
+    assert run == [(every[0], 0, "parallel", "eyes"), (every[1], 1, "parallel", "eyes")]
+    ready.all = every[2:]
+    assert not _tune.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, bounds)
+
+    def fails(*_: Any) -> Any:
+        raise DataError("overflow")
+
+    ready.all = every
+    monkeypatch.setattr(_tune, "judge_loop", fails)
+    assert not _tune.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, bounds)
+
+
+@pytest.mark.parametrize("holds", [[True], [False, True, True], [False, False, False], [False, False, False, True]])
+def test_the_first_whose_certificate_holds_is_taken_and_else_the_best(
+    holds: list[bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    items = [of_kind("a", 0.1 * (k + 1), number=k) for k in range(len(holds))] + [of_kind("a", 5.0)]
+    tried: list[int] = []
+
+    def verified(task: Any, controller: Any, kind: str, files: Any, attempt: int) -> Any:
+        tried.append(attempt)
+        return SimpleNamespace(holds=holds[attempt - 1], number=attempt - 1)
+
+    monkeypatch.setattr(_tune, "prepare", lambda _: None)
+    monkeypatch.setattr(_tune, "design_candidate", lambda *_: None)
+    monkeypatch.setattr(_tune, "_verify_candidate", verified)
+    search = searching()
+    most = _tune._MAX_VERIFICATIONS
+    best, verification, _ = _tune._verify_best(search, items, None, lambda *_: None)
+    first = next((k for k, held in enumerate(holds[:most]) if held), None)
+    assert best is items[first or 0]
+    assert verification.number == (first or 0)
+    # Each attempt at a certificate has a number of its own: its draws are none that another has seen.
+    assert tried == list(range(1, (min(len(holds), most) if first is None else first + 1) + 1))
+    # If none holds in the search, the best alone is verified.
+    tried.clear()
+    assert _tune._verify_best(search, items[-1:] * 2, None, lambda *_: None)[0] is items[-1]
+    assert tried == [1]
+
+
+def ended(
+    monkeypatch: pytest.MonkeyPatch, *, verified: list[Any], level: str = "all", own: bool = True, m: float = 0.5
+) -> Any:
+    """Return the result of a search whose best has this level, over verdicts (holds, value)."""
+    bounds = (Requirement("sim.rise_s", "max", 1.0, True),)
+    task = task_for({}, own={"p": 1} if own else {}, bounds=bounds, tested=False)
+    best = Candidate("pi", {}, np.zeros(1), level, {"sim.rise_s": m, "axes.sensitivity": 1.0})
+    failed = [SimpleNamespace(value=value, requirement=bounds[0]) for holds, value in verified if not holds]
+    verification = SimpleNamespace(holds=not failed, failed=failed)
+    monkeypatch.setattr(_tune, "_verify_best", lambda *_: (best, verification, SimpleNamespace(design={})))
+    monkeypatch.setattr(_tune, "prepare", lambda _: SimpleNamespace(own=()))
+    monkeypatch.setattr(_tune, "make_observer", lambda *_: None)
+    monkeypatch.setattr(_tune, "_relax", lambda found, *_: ("relaxed", found))
+    search: Any = SimpleNamespace(task=task, sort_candidates=lambda: [best], dropped={"lqg": "no"}, spent=[1, 2])
+    return _tune._make_result(search, None, lambda *_: None)
+
+
+def test_a_result_holds_where_its_certificate_its_loops_and_its_search_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    good = ended(monkeypatch, verified=[(True, 0.5)])
+    assert (good.holds, good.binding, good.evaluations, good.dropped) == (True, None, 2, {"lqg": "no"})
+    what, slow = ended(monkeypatch, verified=[(True, 0.5)], m=1.5)
+    assert (what, slow.holds, slow.binding, slow.nearest) == ("relaxed", False, "sim.rise_s", pytest.approx(1.5))
+    # The certificate covers more plants than the search; of two that fail there is no nearest value.
+    what, found = ended(monkeypatch, verified=[(False, 1.2)])
+    assert (what, found.holds, found.binding, found.nearest) == ("relaxed", False, "sim.rise_s", 1.2)
+    _, found = ended(monkeypatch, verified=[(False, 1.2), (False, None)])
+    assert (found.binding, found.nearest) == ("sim.rise_s", None)
+    _, found = ended(monkeypatch, verified=[(False, None)])
+    assert (found.holds, found.binding) == (False, None)
+    # A search that ended before its loops promises nothing, and relaxes nothing; without models there are no loops.
+    early = ended(monkeypatch, verified=[(True, 0.5)], level="linear")
+    assert early.holds is False
+    assert ended(monkeypatch, verified=[(True, 0.5)], level="linear", own=False).holds is True
+
+
+def test_a_search_without_any_result_says_whether_the_budget_or_the_designs_ended_it() -> None:
+    spaces = [SimpleNamespace(kind="pi"), SimpleNamespace(kind="lqg")]
+    for dropped, error in (({"pi": "x"}, CheckFailedError), ({"pi": "x", "lqg": "y"}, SettingsError)):
+        search: Any = SimpleNamespace(task=task_for({}), sort_candidates=list, dropped=dropped, spaces=spaces)
+        with pytest.raises(error, match="pi: x"):
+            _tune._make_result(search, None, lambda *_: None)
+
+
+def test_the_rise_that_is_aimed_at_is_the_shortest_asked_or_two_time_constants() -> None:
+    both = task_for({"require": {"sim.rise_s": {"max": 0.7}, "step.rise_s": {"max": 0.5}}})
+    assert _tune._target_rise(both) == 0.5
+    none = task_for({"require": {"sim.rise_s": False}}, linear={"slow": linear_neck(), "fast": family()})
+    assert _tune._target_rise(none) == pytest.approx(2.0 / 5.293)
+
+
+@pytest.mark.parametrize(
+    ("made", "held"),
+    [
+        ([], None), ([([0.0, 0.0], [0.2, 0.6])], 0.4), ([([0.0, 0.0], [-0.6, 0.6])], None),
+        # Of the heaviest load, the middle one of several.
+        ([([0.0, 0.0], [2.0, 2.0]), ([0.5, 1.0], [0.5, 0.7]), ([1.0, 1.0], [0.1, 0.3]), ([1.0, 1.0], [1.0, 1.2])], 0.6),
+    ],
+)  # fmt: skip
+def test_the_cocontraction_of_loops_is_the_recordings_with_the_heaviest_load(
+    made: list[Any], held: float | None
+) -> None:
+    parts = [{"payload_kg": kg, "cocontraction": ends} for kg, ends in made]
+    thing = SimpleNamespace(findings={"tested": {"conditions": parts}}, robot=Robot.preset())
+    found = _tune._recorded_cocontraction({"f": thing}, Robot.preset())
+    assert found == (None if held is None else pytest.approx(held))
+
+
+def test_what_is_relaxed_is_verified_again_by_draws_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = make_tune_requirements({})
+    task = replace(task_of({"n": linear_neck()}, {}, 0), asked=asked)
+    item = Candidate("pi", {}, np.zeros(1), "all", {"sim.rise_s": 1.0})
+    found: Any = _Found(task, item, SimpleNamespace(failed=[]))
+    tried: list[int] = []
+    for kept, holds in (({}, True), ({"sim.rise_s": _tune.Loosened(0.5, 0.6, 0.7)}, False),
+                        ({"sim.rise_s": _tune.Loosened(0.5, 0.6, 0.7)}, True)):  # fmt: skip
+        monkeypatch.setattr(_tune, "relaxations", lambda *_, kept=kept: kept)
+        monkeypatch.setattr(
+            _tune, "_verify_candidate",
+            lambda task, *rest, holds=holds: tried.append(rest[-1]) or SimpleNamespace(holds=holds, task=task),
+        )  # fmt: skip
+        again = _tune._relax(found, None, lambda *_: None)
+        if not (kept and holds):
+            assert again is found
+            continue
+        assert (again.holds, again.loosened) == (True, kept)
+        assert again.task.asked.limit("sim.rise_s") == again.verification.task.asked.limit("sim.rise_s") == 0.7
+    assert tried == [_tune._MAX_VERIFICATIONS + 1] * 2
+
+
+@dataclass(frozen=True)
+class _Found:
+    task: Any
+    best: Any
+    verification: Any
+    holds: bool = False
+    loosened: Any = None
+    controller: Any = None
