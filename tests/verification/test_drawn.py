@@ -19,7 +19,7 @@ from softneck.loop import LoopResult
 from softneck.verification import _drawn, make_requirements, verify
 from softneck.verification._drawn import Drawn, _Margin, certified_content, draws_of, run_drawn
 from softneck.verification._experiments import Experiment, LoopUnderTest, crossing_values, crossings
-from softneck.verification._neck_loops import loops_under_test, make_simulation_model
+from softneck.verification._neck_loops import loops_under_test, make_simulation_model, rows_of
 
 from .necks import COUNT, QUICK, TS, family, pi, small_draws
 
@@ -225,7 +225,7 @@ def test_outputs_of_a_draw_are_those_that_its_sensor_tells() -> None:
                      roll_measured_seen=[1.0, 2.0, 3.0])  # fmt: skip
     found = _drawn._with_disturbance(told)
     assert (found["pitch"].tolist(), found["roll"].tolist()) == ([5.0, 6.0, 7.0], [1.0, 2.0, 3.0])
-    rows = _drawn._rows(found, 1, 3)
+    rows = rows_of(found, 1, 3)
     assert (rows.time.tolist(), rows["roll"].tolist()) == ([TS, 2 * TS], [2.0, 3.0])
 
 

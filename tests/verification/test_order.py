@@ -285,7 +285,7 @@ def judged(monkeypatch: pytest.MonkeyPatch, result: Any) -> tuple[dict[str, floa
         return result
 
     monkeypatch.setattr(_neck_loops, "run_loop", run)
-    return judge_loop(SimpleNamespace())  # pyright: ignore[reportArgumentType]
+    return judge_loop(SimpleNamespace(reference=None))  # pyright: ignore[reportArgumentType]
 
 
 AXIS = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg")
