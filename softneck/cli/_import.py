@@ -255,8 +255,9 @@ def _at_sample_time(job: _Job, imported: signals.ImportResult) -> signals.Import
 
 
 def _preview(
-    job: _Job, layout: signals.Layout, proposed: signals.Guess | None, imported: signals.ImportResult | None
-) -> str:
+    job: _Job, layout: signals.Layout, proposed: signals.Guess | None, imported: signals.ImportResult | None,
+    problems: tuple[str, ...] = (),
+) -> str:  # fmt: skip
     """Return the page that shows the log's columns and their channels."""
     return plots.import_page(
         job.log,
@@ -265,7 +266,7 @@ def _preview(
         recording=None if imported is None else imported.recording,
         doubts=() if proposed is None else proposed.doubts,
         lines=[*(() if proposed is None else proposed.lines), *(() if imported is None else imported.notes)],
-        problems=() if proposed is None else proposed.missing,
+        problems=(*problems, *(() if proposed is None else proposed.missing)),
     )
 
 
@@ -303,6 +304,9 @@ def _by_guess(job: _Job, whose: Robot) -> tuple[signals.Guess, signals.ImportRes
     try:
         return guess, signals.import_log(job.log, guess.layout), facts
     except DataError as error:
+        if job.html is not None:
+            said = str(error).removeprefix(f"{job.log}: ")
+            job.texts[job.html] = (_preview(job, guess.layout, guess, None, (said,)), job.force)
         job.write()
         note(f"if the columns are wrong, name them: {signals.columns_line(job.log)}")
         raise DataError(f"{error} (The proposed layout is in {proposal}.)") from error

@@ -38,6 +38,8 @@ def import_page(
     """
     charts = _charts(frame, layout, recording)
     sections = [_doubts_section(doubts, problems, lines, charts[:1]), _mapping(frame, layout, recording)]
+    if recording is None:
+        sections.insert(1, Section("Columns of the log", tables=[_columns(frame, layout)]))
     if charts[1:]:
         sections.append(Section("Raw columns and channels", charts=charts[1:]))
     if left_out := [line.removeprefix("ignored: ") for line in lines if line.startswith("ignored: ")]:
@@ -67,7 +69,8 @@ def _doubts_section(
         ("note", f"{one} ({'or: ' + ', '.join(one.choices) if one.choices else 'if not, edit the layout'})")
         for one in doubts
     ]
-    if not doubts:
+    findings = list(dict.fromkeys(findings))
+    if not doubts and not problems:
         findings.append(("ok", "every guess is at least 90 % sure."))
     method = "Left: columns as logged, by row. Right: channels of the recording over time, in the same colours."
     return Section("Doubts", findings=findings, charts=charts, method=[method] if charts else [])
@@ -89,6 +92,22 @@ def _mapping(frame: pd.DataFrame, layout: Layout, recording: Recording | None) -
         rows.append([name, _source_text(source), made, how.strip()])
     head = ["channel", "from", "in the recording", ""]
     return Section("Mapping", text=text, tables=[Table("Channels", head, rows, text=2)])
+
+
+def _columns(frame: pd.DataFrame, layout: Layout) -> Table:
+    """Return a table of the raw columns: the unit that was read, the range, and what each seems to be."""
+    sources, rows = _sources(layout), []
+    for number, title in enumerate(frame.columns):
+        taken = {
+            name: source for name, source in sources.items()
+            if any(term.column in (title, number) for term in source.terms)
+        }  # fmt: skip
+        values = _column(frame, title)
+        seen = values[np.isfinite(values)]
+        ends = [f"{seen.min():.4g}", f"{seen.max():.4g}"] if seen.size else ["no number", ""]
+        unit = ", ".join(dict.fromkeys(source.unit for source in taken.values())) or "-"
+        rows.append([str(title), unit, *ends, ", ".join(taken) or "not recognised"])
+    return Table("Columns", ["column", "unit read", "least", "largest", "seems to be"], rows)
 
 
 def _sources(layout: Layout) -> dict[str, Source]:

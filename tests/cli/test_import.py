@@ -143,7 +143,14 @@ def test_a_preview_of_what_lacks_something_says_what(call: Call, tmp_path: Path)
     assert call("import", "log.csv", "--guess", "-o", "r.csv", "--html", "p.html").code == 2
     page = (tmp_path / "p.html").read_text()
     assert "No recording: the sample time" in page
-    assert "missing: the sample time" in page
+    assert page.count("missing: the sample time") == 1
+    frame = pd.read_csv("log.csv")
+    rows = re.findall(r'<td class="text"[^>]*>(\w+)</td>' + 4 * r"<td[^>]*>([^<]*)</td>", page)
+    assert [row[0] for row in rows] == list(frame.columns)
+    for title, unit, least, largest, taken in rows:
+        assert (least, largest) == (f"{frame[title].min():.4g}", f"{frame[title].max():.4g}")
+        assert (unit == "-") == (taken == "not recognised")
+    assert {row[0]: row[4] for row in rows}["roll"] == "roll"
     assert files(tmp_path) == {"log.csv", "p.html", "r.layout.toml"}
 
 
@@ -277,3 +284,17 @@ def test_resample_brings_a_recording_to_another_sample_time(call: Call, tmp_path
     )
     assert "none.csv: no such file" in call("import", "none.csv", "--resample", "1", "-o", "d.csv").error
     assert not (tmp_path / "d.csv").exists()
+
+
+def test_a_log_that_its_layout_cannot_import_leaves_a_page_with_the_reason(call: Call, tmp_path: Path) -> None:
+    log(tmp_path, motors=3.0, platform=20.0)
+    frame = pd.read_csv("log.csv")
+    frame.loc[5:40, "roll"] = -999.0
+    frame.to_csv("log.csv", index=False)
+    said = call("import", "log.csv", "--guess", "--yes", "-o", "r.csv", "--html", "p.html")
+    assert said.code == 2
+    page = (tmp_path / "p.html").read_text()
+    assert "No recording: " in page
+    assert "mark missed samples" in page
+    assert "<h2>Columns of the log" in page
+    assert files(tmp_path) == {"log.csv", "p.html", "r.layout.toml"}
