@@ -219,10 +219,10 @@ def test_a_kind_that_the_translator_refused_says_why(tmp_path: Path, monkeypatch
     from softneck.fmu.compiled import _build
 
     library = _library.find_library()
-    refused = {"softneck.identification.linear._rls_runtime": "`step`: `np.linalg.solve(A, b)`: no translation to C."}
+    refused = {"softneck.fmu.describe._tunable_plant_runtime": "`step`: `np.linalg.solve(A, b)`: no translation to C."}
     changed = dataclasses.replace(library, sources=dataclasses.replace(library.sources, refused=refused))
     monkeypatch.setattr(_build, "find_library", lambda _: changed)
-    with pytest.raises(SettingsError, match=r"_rls_runtime` cannot be in a compiled FMU: `step`: `np.linalg"):
+    with pytest.raises(SettingsError, match=r"_tunable_plant_runtime` cannot be in a compiled FMU: `step`: `np.linalg"):
         build_compiled_fmu(block_of("rls"), tmp_path / "X.fmu")
 
 

@@ -1,4 +1,4 @@
-"""Gains that change during a run: the loop of a re-designed controller, without a jump of the command."""
+"""Parameters that change during a run: the loop of a re-designed controller without a jump, and other plants."""
 
 from __future__ import annotations
 
@@ -311,3 +311,49 @@ def test_another_master_changes_a_gain(importer: str, tmp_path: Path) -> None:
     done = subprocess.run(script, capture_output=True, text=True, timeout=120, check=False)
     assert out.is_file(), done.stderr[-2000:]
     np.testing.assert_allclose(np.load(out), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["rls", "oe"])
+def test_a_plant_with_its_start_values_changes_no_bit(kind: str) -> None:
+    block, u = block_of(kind), inputs_of(block_of(kind), 200)
+    whole, identified = exported_block(block), plain_run(block, u, use_measurement=1.0)
+    np.testing.assert_array_equal(plain_run(whole, u, use_measurement=1.0), identified)
+    for port in whole.parameters[len(block.parameters) :]:
+        assert port.tunable
+        other = port.start + 1.0 if port.integer else port.start * (1.0 + 1e-9)
+        assert not np.array_equal(plain_run(whole, u, use_measurement=1.0, **{port.name: other}), identified), port.name
+
+
+def test_plants_of_other_forms_have_none() -> None:
+    for kind in ("miso", "oe2"):
+        assert not any(port.tunable for port in exported_block(block_of(kind)).parameters)
+
+
+@pytest.mark.parametrize("build", [build_fmu, pytest.param(build_compiled_fmu, marks=needs_c)])
+def test_a_plant_changed_while_running_is_the_textbooks(build: Any, tmp_path: Path, running: Any) -> None:
+    block, path = exported_block(block_of("rls")), tmp_path / "Plant.fmu"
+    build(block_of("rls"), path)
+    start = {port.name: port.start for port in block.parameters}
+    T = block_of("rls").arrays[4]  # the redefinition
+    u = np.random.default_rng(5).uniform(-1.0, 1.0, (80, 3))
+    value = {name: start[f"pitch_{name}"] for name in ("gain", "time_constant", "dead_time")}
+    changes = {20: ("gain", 1.5 * value["gain"]), 35: ("time_constant", 2.0 * value["time_constant"]),
+               50: ("dead_time", 4.0), 65: ("dead_time", 1.0)}  # fmt: skip
+    y, seen, expected = 0.0, [], []
+    with running(path) as fmu:
+        fmu.begin()
+        for k, row in enumerate(u):
+            if k in changes:
+                name, new = changes[k]
+                fmu.set(**{f"pitch_{name}": new})
+                value[name] = new
+            fmu.set(**dict(zip(MOTORS, row, strict=True)))
+            fmu.fmu.doStep(k * TS, TS)
+            seen.append(fmu.get("pitch")[0])
+            p, late = np.exp(-TS / value["time_constant"]), k - int(value["dead_time"])
+            y = p * y + value["gain"] * (1.0 - p) * (T[0] @ u[late] if late >= 0 else 0.0)
+            expected.append(y)
+        with pytest.raises(FMICallException):
+            fmu.set(pitch_dead_time=start["pitch_dead_time"] + 11.0)  # beyond the maximum that it declares
+    # The start values have 15 digits of the model's; 80 samples of a stable recursion.
+    np.testing.assert_allclose(seen, expected, rtol=0, atol=1e-13)

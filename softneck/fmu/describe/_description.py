@@ -22,7 +22,7 @@ from softneck.robot import is_set_point, motor_positions_among
 from softneck.runtime import Block, Port
 
 from ._describe import FmuInfo
-from ._tunable import with_tunable_gains
+from ._tunable import with_tunable_parameters
 
 _DRIVES_RUNTIME = "softneck.fmu.describe._modelled_drives_runtime"
 # Index of the first motor position in a neck's controller, and number of motors: the defaults of the runtime.
@@ -108,7 +108,7 @@ class Identity:
 
 def exported_block(block: Block) -> Block:
     """Return `block` as in its FMU: with tunable gains, a model of the drives, a range of references."""
-    whole = with_modelled_drives(with_tunable_gains(block))
+    whole = with_modelled_drives(with_tunable_parameters(block))
     return replace(whole, inputs=tuple(_with_reference_range(port) for port in whole.inputs))
 
 

@@ -1,4 +1,4 @@
-"""Gains of PI and PID controllers as tunable parameters of their FMUs."""
+"""Tunable parameters of FMUs: gains of PI and PID, and gain, time constant and dead time of first-order plants."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from softneck.core import Matrix
 from softneck.design.linear._linear_parts_runtime import LinearArrays
+from softneck.identification.linear._arx_runtime import ArxArrays
 from softneck.runtime import Block, Port
 
 _LINEAR_RUNTIME = "softneck.design.linear._linear_controller_runtime"
@@ -17,6 +18,83 @@ _GAINS_RUNTIME = "softneck.fmu.describe._tunable_gains_runtime"
 _GAINS = {"pi": ("K", "Ti"), "pid": ("K", "Ti", "Td", "Tf")}
 _MEANING = {"K": "gain K", "Ti": "integral time Ti", "Td": "derivative time Td", "Tf": "filter time Tf"}
 _LAW = {"pi": "v = K (e + 1/Ti int e)", "pid": "v = K (e + 1/Ti int e - Td s y/(1 + Tf s))"}
+
+
+# Runtime -> arrays that it lacks of those of `_PLANT_RUNTIME`: `rls` takes set-points only.
+_PLANTS = {
+    "softneck.identification.linear._rls_runtime": (np.zeros(1),),
+    "softneck.identification.linear._oe_runtime": (),
+}
+_PLANT_RUNTIME = "softneck.fmu.describe._tunable_plant_runtime"
+# A dead time may be twice as long, and this many samples longer at least.
+_MORE_DEAD_TIME = 10
+
+
+def with_tunable_parameters(block: Block) -> Block:
+    """Add tunable parameters to a PI, a PID or a first-order plant; other blocks are returned unchanged."""
+    return with_tunable_plant(block) if block.role == "plant" else with_tunable_gains(block)
+
+
+def with_tunable_plant(block: Block) -> Block:
+    """Add gain, time constant and dead time of each output of a first-order transfer function to its parameters.
+
+    The gain keeps its sign, within 0.01 to 100 times that of the model.
+    """
+    module, at, size = block.runtime.partition("@")
+    if module not in _PLANTS:
+        return block
+    p = ArxArrays(block.arrays)
+    if p.a.ndim != 2 or p.a.shape[1] != 1:  # arrays of wrong ranks are refused by name later
+        return block
+    a = p.a[:, 0]
+    gains = p.b.sum(axis=1) / (1.0 + a)
+    if not ((a < 0.0) & (a > -1.0) & (gains != 0.0)).all():
+        return block
+    identified = _rounded([gains, -block.sample_time / np.log(-a)])
+    longest = np.maximum(2.0 * p.delay, p.delay + _MORE_DEAD_TIME)
+    arrays = list(block.arrays)
+    # Histories hold the set-points of the longest dead time.
+    arrays[ArxArrays.place("history")] = p.history.copy()
+    arrays[ArxArrays.place("history")][0] = max(p.history[0], longest.max() + p.b.shape[1])
+    ports = []
+    for output, (gain, lag), delay, most in zip(block.outputs, identified, p.delay, longest, strict=False):
+        ports += _plant_ports(block, output, (float(gain), float(lag), float(delay)), float(most))
+    return replace(
+        block,
+        runtime=f"{_PLANT_RUNTIME}{at}{size}",
+        arrays=(*arrays, *_PLANTS[module], identified, np.array([block.sample_time])),
+        parameters=(*block.parameters, *ports),
+    )
+
+
+def _plant_ports(block: Block, output: Port, values: Sequence[float], most: float) -> list[Port]:
+    (gain, lag, delay), Ts = values, block.sample_time
+    low, high = _span(gain)
+    unit = _per(block.inputs[0].unit, output.unit)
+    return [
+        Port(name=f"{output.name}_gain", unit=unit, start=gain, minimum=low, maximum=high, tunable=True,
+             description=f"static gain of {output.name}"),
+        Port(name=f"{output.name}_time_constant", unit="s", start=lag, minimum=float(f"{0.01 * min(lag, Ts):.3g}"),
+             maximum=float(f"{100.0 * lag:.3g}"), tunable=True, description=f"time constant of {output.name}"),
+        Port(name=f"{output.name}_dead_time", start=delay, minimum=0.0, maximum=most, integer=True, tunable=True,
+             description=f"dead time of {output.name} in samples of {Ts:g} s, beside that of its motors"),
+    ]  # fmt: skip
+
+
+def _span(gain: float) -> tuple[float, float]:
+    """Return the range of a gain."""
+    low, high = sorted(float(f"{factor * gain:.3g}") for factor in (0.01, 100.0))
+    return low, high
+
+
+def _per(over: str, under: str) -> str:
+    """Return the unit of a gain from `over` to `under`."""
+    return "1" if over == under else f"{under}/{over}"
+
+
+def _rounded(columns: Sequence[np.ndarray]) -> Matrix:
+    """Return columns side by side, to fifteen digits: rounding of the design is not shown."""
+    return np.array([[float(f"{value:.15g}") for value in row] for row in np.transpose(columns)])
 
 
 def with_tunable_gains(block: Block) -> Block:
@@ -47,11 +125,11 @@ def with_tunable_gains(block: Block) -> Block:
 
 def _ports(block: Block, reference: Port, motors: str, gains: Sequence[float]) -> list[Port]:
     axis, Ts = reference.name.removesuffix("_reference"), block.sample_time
-    unit = "1" if motors == reference.unit else f"{motors}/{reference.unit}"
+    unit = _per(reference.unit, motors)
     ports = []
     for name, start in zip(_GAINS[block.kind], gains, strict=True):
         if name == "K":
-            low, high = sorted(float(f"{factor * start:.3g}") for factor in (0.01, 100.0))
+            low, high = _span(start)
         else:
             low, high = min(start, Ts) if name == "Ti" else 0.0, float(f"{1e4 * max(start, Ts):.3g}")
         what = f"{_MEANING[name]} of {axis} in {_LAW[block.kind]}"
@@ -74,7 +152,7 @@ def _gains(kind: str, arrays: tuple[Matrix, ...]) -> Matrix | None:
     p = LinearArrays(arrays)
     m, Ts = len(p.Dr), float(p.constants[0])
     axes, states = np.arange(m), len(_GAINS[kind]) // 2
-    if len(p.A) != states * m:
+    if p.Br.ndim != 2 or len(p.A) != states * m:
         return None
     rate, direct = p.Br[states * axes, axes], p.Dr[axes, axes]
     K = direct if kind == "pi" else direct - rate
@@ -87,6 +165,5 @@ def _gains(kind: str, arrays: tuple[Matrix, ...]) -> Matrix | None:
             return None
         Tf = a * Ts / (1.0 - a)
         columns += [input_gain / (1.0 - a) * (Tf + Ts) / K, Tf]
-    # Fifteen digits: rounding of the design is not shown.
-    gains = np.array([[float(f"{value:.15g}") for value in row] for row in np.transpose(columns)])
+    gains = _rounded(columns)
     return gains if (gains[:, 1:] >= 0.0).all() and (gains[:, 1] > 0.0).all() else None

@@ -30,6 +30,7 @@ _NECK_RUNTIMES = (
     "softneck.design.predictive._mpc_runtime",
     "softneck.fmu.describe._modelled_drives_runtime",
     "softneck.fmu.describe._tunable_gains_runtime",
+    "softneck.fmu.describe._tunable_plant_runtime",
     "softneck.loop._reference_runtime",
 )
 # Runtimes for robots of any size, in addition to those above, whose sizes are the neck's and known at compile time.
@@ -48,6 +49,7 @@ _ROBOT_RUNTIMES = (
     "softneck.design.varying._adaptive_runtime",
     "softneck.design.predictive._mpc_runtime",
     "softneck.fmu.describe._tunable_gains_runtime",
+    "softneck.fmu.describe._tunable_plant_runtime",
     "softneck.loop._reference_runtime",
 )
 RUNTIMES = (*_NECK_RUNTIMES, *(f"{module}@{ANY_SIZE}" for module in _ROBOT_RUNTIMES))
@@ -74,6 +76,7 @@ LIBRARIES = {
 # search among thousands of points and a quadratic program spend their time in every loop.
 FAST = {
     "softneck.identification.linear._rls_runtime": 0,
+    "softneck.fmu.describe._tunable_plant_runtime": 0,
     "softneck.identification.set_membership._nlsm_runtime": 1,
     "softneck.identification.networks._nn_runtime": 0,
     "softneck.plant._neck_runtime": 0,
