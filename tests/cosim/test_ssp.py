@@ -16,7 +16,7 @@ from fmpy.ssp.simulation import simulate_ssp
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it has no stubs
 
 from softneck.core import OutputFileError, SettingsError
-from softneck.cosim import load_loop, simulate, write_ssp
+from softneck.cosim import load_loop, load_ssp, simulate, write_ssp
 from softneck.cosim.loops._loop_file import LoopSetup, reference_of
 from softneck.fmu import build_fmu
 from softneck.loop import BlockPart, Loop, SensorFault, StepReference
@@ -43,6 +43,7 @@ roll_deg = -4.0
 at_s = 0.2
 rise_s = 0.5
 """
+_VALUES = "{http://ssp-standard.org/SSP1/SystemStructureParameterValues}"
 _SPACE = "{http://ssp-standard.org/SSP1/SystemStructureDescription}"
 
 
@@ -61,6 +62,11 @@ def archive(setup: LoopSetup, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def structure(path: Path) -> Any:
     with zipfile.ZipFile(path) as members:
         return etree.fromstring(members.read("SystemStructure.ssd"))
+
+
+def parameters(path: Path, part: str) -> Any:
+    with zipfile.ZipFile(path) as members:
+        return etree.fromstring(members.read(f"resources/{part}.ssv"))
 
 
 def run_in(master: str, path: Path, signals: list[tuple[str, str]], rows: int, folder: Path) -> np.ndarray:
@@ -89,6 +95,29 @@ def test_other_masters_compute_our_jacobi_loop(master: str, setup: LoopSetup, ar
         # Same FMUs, same order of calls; 1e-12 is the issue's limit and leaves room for compiled against plain Python.
         np.testing.assert_allclose(column[1:], expected[1:], rtol=0, atol=1e-12, err_msg=f"{part}.{name}")
     assert np.abs(ours["pitch"]).max() > 0.02  # the loop does move
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("master", list(PACKAGES))
+def test_another_master_reads_changed_parameters(master: str, archive: Path, tmp_path: Path) -> None:
+    changed, name = tmp_path / "Changed.ssp", "resources/controller.ssv"
+    with zipfile.ZipFile(archive) as old, zipfile.ZipFile(changed, "w") as new:
+        for member in old.namelist():
+            data = old.read(member)
+            if member == name:
+                table = etree.fromstring(data)
+                for axis in ("pitch", "roll"):
+                    real = table.find(f".//{_VALUES}Parameter[@name='{axis}_K']/{_VALUES}Real")
+                    real.set("value", repr(0.5 * float(real.get("value"))))
+                data = etree.tostring(table)
+            new.writestr(member, data)
+    signals = [("plant", "pitch"), ("controller", "motor_setpoint_1")]
+    theirs, ours = run_in(master, changed, signals, 100, tmp_path), simulate(load_ssp(changed))
+    for (_, signal), column in zip(signals, theirs.T, strict=True):
+        # As above: the same FMUs in the same order of calls.
+        np.testing.assert_allclose(column[1:], ours[signal][1:], rtol=0, atol=1e-12)
+    plain = simulate(load_ssp(archive))
+    assert np.abs(ours["pitch"] - plain["pitch"]).max() > 1e-3  # a softer controller is another loop
 
 
 def test_fmpys_own_master_follows_the_loop(setup: LoopSetup, archive: Path) -> None:
@@ -137,9 +166,12 @@ def test_units_that_differ_are_converted_on_the_way(fmus: Path, toys: Any, tmp_p
 
 
 def test_the_description_holds_to_the_schema(archive: Path) -> None:
-    schema = Path(fmpy.__file__).parent / "ssp" / "schema" / "SystemStructureDescription.xsd"
-    checker = etree.XMLSchema(etree.parse(str(schema)))
+    folder = Path(fmpy.__file__).parent / "ssp" / "schema"
+    checker = etree.XMLSchema(etree.parse(str(folder / "SystemStructureDescription.xsd")))
     assert checker.validate(structure(archive)), checker.error_log
+    values = etree.XMLSchema(etree.parse(str(folder / "SystemStructureParameterValues.xsd")))
+    for part in ("plant", "controller"):
+        assert values.validate(parameters(archive, part)), values.error_log
 
 
 def test_it_names_parts_units_values_experiment_and_places(archive: Path) -> None:
@@ -149,9 +181,11 @@ def test_it_names_parts_units_values_experiment_and_places(archive: Path) -> Non
     with zipfile.ZipFile(archive) as members:
         assert {item.get("source") for item in components.values()} <= set(members.namelist())
     text = etree.tostring(root).decode()
-    assert 'name="payload"><ssv:Real value="0.2"/>' in text.replace("\n", "").replace("  ", "").replace("> <", "><")
-    flat = "".join(line.strip() for line in text.splitlines())
-    assert 'name="use_motor_positions"><ssv:Boolean value="true"/>' in flat  # the controller was a file
+    named = f"{_VALUES}Parameters/{_VALUES}Parameter[@name='%s']/*"
+    assert dict(parameters(archive, "plant").find(named % "payload").attrib) == {"value": "0.2", "unit": "kg"}
+    controller = parameters(archive, "controller")
+    assert dict(controller.find(named % "use_motor_positions").attrib) == {"value": "true"}  # the controller was a file
+    assert controller.find(named % "pitch_Ti").get("unit") == "s"  # what a person turns is there to be changed
     assert root.find(f"{_SPACE}DefaultExperiment").attrib == {"startTime": "0", "stopTime": "2.0"}
     assert 'FixedStepMaster description="oms-ma" stepSize="0.02"' in text
     boxes = [item.find(f"{_SPACE}ElementGeometry").attrib for item in components.values()]

@@ -85,7 +85,7 @@ def system_description(
     # After that of OMSimulator, which reads only the first annotation.
     note = SubElement(notes, "ssc:Annotation", {"type": "softneck"})
     SubElement(note, "Master", {"order": "jacobi", "stepSize": repr(step)})
-    _units(root, components)
+    _units(root, "ssd", [port for item in components for port in (*item.inputs, *item.outputs)])
     experiment = SubElement(root, "ssd:DefaultExperiment", {"startTime": "0", "stopTime": repr(duration)})
     # Without this OMSimulator reports the file as deprecated.
     results = {"resultFile": f"{name}_res.mat", "bufferSize": "1"}
@@ -110,7 +110,8 @@ def _component_element(elements: Element, component: Component, corner: tuple[fl
     box = {"x1": f"{x:g}", "y1": f"{y:g}", "x2": f"{x + _WIDTH:g}", "y2": f"{y + _HEIGHT:g}"}
     SubElement(element, "ssd:ElementGeometry", box)
     if component.values:
-        _bindings(element, component)
+        binding = {"type": "application/x-ssp-parameter-set", "source": parameter_file(component)}
+        SubElement(SubElement(element, "ssd:ParameterBindings"), "ssd:ParameterBinding", binding)
 
 
 def _type(parent: Element, port: Port) -> None:
@@ -120,10 +121,15 @@ def _type(parent: Element, port: Port) -> None:
         SubElement(parent, "ssc:Real", {} if port.unit in ("", "1") else {"unit": port.unit})
 
 
-def _bindings(element: Element, component: Component) -> None:
-    binding = SubElement(SubElement(element, "ssd:ParameterBindings"), "ssd:ParameterBinding")
-    values = SubElement(binding, "ssd:ParameterValues")
-    table = SubElement(values, "ssv:ParameterSet", {"version": "1.0", "name": "initialValues"})
+def parameter_file(component: Component) -> str:
+    """Return the name of the component's parameter set in the archive."""
+    return f"resources/{component.name}.ssv"
+
+
+def parameter_set(component: Component) -> bytes:
+    """Return the XML text of the component's parameters and constant inputs, with their units."""
+    spaces = {key: _SPACES[key] for key in ("xmlns:ssc", "xmlns:ssv")}
+    table = Element("ssv:ParameterSet", {**spaces, "version": "1.0", "name": "initialValues"})
     parameters = SubElement(table, "ssv:Parameters")
     for port, value in component.values:
         parameter = SubElement(parameters, "ssv:Parameter", {"name": port.name})
@@ -132,7 +138,11 @@ def _bindings(element: Element, component: Component) -> None:
         elif port.integer:
             SubElement(parameter, "ssv:Integer", {"value": str(int(value))})
         else:
-            SubElement(parameter, "ssv:Real", {"value": repr(value)})
+            unit = {} if port.unit in ("", "1") else {"unit": port.unit}
+            SubElement(parameter, "ssv:Real", {"value": repr(value), **unit})
+    _units(table, "ssv", [port for port, _ in component.values])
+    indent(table)
+    return tostring(table, encoding="utf-8", xml_declaration=True)
 
 
 def _connection(connections: Element, link: Connection) -> None:
@@ -151,12 +161,11 @@ def _omsimulator(notes: Element) -> Element:
     return SubElement(SubElement(notes, "ssc:Annotation", {"type": "org.openmodelica"}), "oms:Annotations")
 
 
-def _units(root: Element, components: Sequence[Component]) -> None:
-    ports = [port for item in components for port in (*item.inputs, *item.outputs)]
+def _units(root: Element, space: str, ports: Sequence[Port]) -> None:
     names = sorted({port.unit for port in ports if not port.boolean and port.unit not in ("", "1")})
     if not names:
         return
-    units = SubElement(root, "ssd:Units")
+    units = SubElement(root, f"{space}:Units")
     for name in names:
         unit = SubElement(units, "ssc:Unit", {"name": name})
         try:
@@ -236,6 +245,7 @@ def write_ssp(loop: Loop | LoopSetup | System, path: str | Path, *, force: bool 
         parts = [_component(name, part, sources[name], plain, wiring) for name, part in plain.parts.items()]
         text = system_description(target.stem, parts, _links(plain, wiring), step=step, duration=plain.duration)
         members = {"SystemStructure.ssd": text}
+        members |= {parameter_file(item): parameter_set(item) for item in parts if item.values}
         members |= {f"resources/{source.name}": source.read_bytes() for source in sources.values()}
         _write(target, members, force=force)
     return target
@@ -282,7 +292,8 @@ def _component(name: str, part: Part, source: Path, loop: Loop | System, wiring:
     known = {port.name: port for port in (*part.inputs, *_parameters(part))}
     # A block gets this parameter only as an FMU; see `Loop.parameters`.
     defaults = {USE_MOTOR_POSITIONS: 1.0} if USE_MOTOR_POSITIONS in known and isinstance(loop, Loop) else {}
-    values = {**constants, **defaults, **loop.parameters.get(name, {})}
+    tunable = {port.name: port.start for port in known.values() if port.tunable}
+    values = {**constants, **tunable, **defaults, **loop.parameters.get(name, {})}
     for key in values:
         if key not in known:
             raise SettingsError(f"`{key}` is not a parameter of the {name}; it has {', '.join(known) or 'none'}.")
