@@ -48,7 +48,7 @@ def answered(seen: World, controller: Any) -> Matrix:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["finger", "joint"])
+@pytest.mark.parametrize("name", ["joint", pytest.param("finger", marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("kind", _KINDS)
 def test_a_controller_is_the_same_in_every_view(name: str, kind: str) -> None:
     plain = answered(*controller_of(name, kind, _PLAIN))

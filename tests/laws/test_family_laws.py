@@ -46,7 +46,7 @@ def world_names(seen: World) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["finger", "arm"])
+@pytest.mark.parametrize("name", ["finger", pytest.param("arm", marks=pytest.mark.nightly)])
 def test_a_family_is_the_same_in_every_view(name: str) -> None:
     plain = numbers(*family_of(name, _PLAIN))
     for view in (*UNITS[name], *PACES, *orders(name)):

@@ -104,7 +104,8 @@ def test_every_kind_sees_the_same(label: str, name: str, view: View) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["finger", pytest.param("arm", marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", ["finger", "arm"])
 def test_auto_chooses_the_same(name: str) -> None:
     """Scores are fits of models that agree to 1e-6 of the range: to 1e-3 of a point."""
 

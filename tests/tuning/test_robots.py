@@ -40,7 +40,7 @@ def tuned(plants: dict[str, Any]) -> Tuned:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["antagonist", "trunk4"])
+@pytest.mark.parametrize("name", ["antagonist", pytest.param("trunk4", marks=pytest.mark.nightly)])
 def test_a_robots_own_plant_steps_as_the_linear_one_that_it_is(name: str) -> None:
     model = plant(Robot.preset(name))
     found = tuned({"model": model, "again": model.block()})
