@@ -18,7 +18,7 @@ from softneck.design import assumed_lines
 from softneck.loop import error_unit
 from softneck.plots import GREY, Chart, Curve, Panel, Section, Table, cell, curve_styles, page, write_page
 from softneck.tuning import curve_times
-from softneck.verification import metric_title, nominal_plants, sources_of, write_linear
+from softneck.verification import metric_title, nominal_plants, sources_of, start_of, write_linear
 
 from ._tuner import tuner_page
 
@@ -119,12 +119,13 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
     neck = task.asked.certificate.sim
     first, unit = robot.outputs.names[0], error_unit(robot)[0]
     kind = {".fmu": "fmu", ".npz": "model"}.get(Path(path).suffix, "neck")
+    start = float(task.asked.certificate.scale.shown(start_of(robot)[0]))
     table: dict[str, Any] = {
         "duration_s": at + float(neck["duration_s"]),
         "plant": {kind: path if isinstance(path, str) else Path(os.path.relpath(path, folder)).as_posix()},
         **({"observer": {"file": OBSERVER}} if found.observed else {}),
         "controller": {"file": BEST},
-        "reference": {"kind": "step", f"{first}_{unit}": float(neck["size_deg"]), "at_s": at},
+        "reference": {"kind": "step", f"{first}_{unit}": start + float(neck["size_deg"]), "at_s": at},
     }
     if any(plant.payload and plant.name == name for plant in found.own):
         table["plant"]["parameters"] = {"payload": float(max(neck["payloads_kg"]))}
@@ -132,7 +133,9 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
         table["reference"]["cocontraction"] = task.said_cocontraction
     limits = {b.metric.partition(".")[2]: b.limit for b in task.asked.bounds
              if b.metric.startswith("sim.") and b.bound != "min" and not b.metric.endswith("slack_s")}  # fmt: skip
-    known = ("rise_s", "steady_rms_") + (("overshoot_pct", "settling_s") if task.asked.shows_settling() else ())
+    # From zero to a step away from it is a larger motion than was asked for: of that the end alone is judged.
+    shape = ("rise_s", *(("overshoot_pct", "settling_s") if task.asked.shows_settling() else ()))
+    known = ("steady_rms_", *(() if start else shape))
     table["limits"] = {f"{first}.{key}": limit for key, limit in limits.items() if key.startswith(known)}
     words = "" if found.observed else (
         "\n# Without observer.npz: with it a requirement on the steps fails, or none was designed."

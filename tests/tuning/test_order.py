@@ -770,6 +770,7 @@ def test_the_first_whose_certificate_holds_is_taken_and_else_the_best(
     monkeypatch.setattr(_tune, "_verify_candidate", verified)
     search = searching()
     most = _tune._MAX_VERIFICATIONS
+    verification: Any
     best, verification, _ = _tune._verify_best(search, items, None, lambda *_: None)
     first = next((k for k, held in enumerate(holds[:most]) if held), None)
     assert best is items[first or 0]
@@ -862,7 +863,7 @@ def test_what_is_relaxed_is_verified_again_by_draws_of_its_own(monkeypatch: pyte
             _tune, "_verify_candidate",
             lambda task, *rest, holds=holds: tried.append(rest[-1]) or SimpleNamespace(holds=holds, task=task),
         )  # fmt: skip
-        again = _tune._relax(found, None, lambda *_: None)
+        again: Any = _tune._relax(found, None, lambda *_: None)
         if not (kept and holds):
             assert again is found
             continue

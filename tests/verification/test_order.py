@@ -486,8 +486,10 @@ def test_the_worst_plant_of_each_requirement_is_written_as_what_it_is(monkeypatc
     worst = [{**line, "axis": "roll"}, {**line, "axis": "both"}, {"kind": "neck", "name": "k"}, {"kind": "draw"}, {}]
     verdicts = [Verdict(item, 1.0, False, one) for one in worst]
     under: Any = SimpleNamespace(robot=Robot.preset(), block="block")
-    found = Verification(verdicts=verdicts, evidence=None, controller=under, necks=[SimpleNamespace(weights="W")],
-                         requirements=make_requirements({}))  # pyright: ignore[reportArgumentType]  # fmt: skip
+    evidence: Any = None
+    necks: Any = [SimpleNamespace(weights="W")]
+    found = Verification(verdicts=verdicts, evidence=evidence, controller=under, necks=necks,
+                         requirements=make_requirements({}))  # fmt: skip
     files = found.write_worst("to", controller="c.npz", observer="o.npz", force=True)
     assert files == {0: Path("linear"), 1: Path("linear"), 2: Path("neck")}
     assert [args[2]["axis"] for args, _ in written[:2]] == [1, 0]
@@ -551,6 +553,7 @@ def test_samples_that_a_family_did_not_use_are_no_plants() -> None:
     axis = replace(whole.axes["roll"], used=np.array([1.0, 0.0, 0.6, 0.5, 1.0, 0.0]))
     source = source_of_family(replace(whole, axes={**whole.axes, "roll": axis}), "f")
     np.testing.assert_array_equal(source.axes[1].samples, whole.axes["roll"].samples[[0, 2, 4]])
+    assert source.axes[1].std is not None
     assert source.axes[1].std.shape == (3, 3)
     assert source.axes[0].samples.shape == (6, 3)
     none = replace(whole, axes={**whole.axes, "roll": replace(axis, used=np.zeros(6))})
