@@ -116,7 +116,9 @@ def test_fmus_and_pages_of_a_tank(call: Call, log: Path, tmp_path: Path) -> None
     assert call("info", "rec.csv", "--html", "q.html").code == 0
     assert call("validate", "m.npz", "--data", "rec.csv", "--html", "v.html").code == 0
     assert "valve_2_setpoint" in (tmp_path / "q.html").read_text(encoding="utf-8")
-    assert "errors in mm, level" in (tmp_path / "v.html").read_text(encoding="utf-8")
+    page = (tmp_path / "v.html").read_text(encoding="utf-8")
+    assert "errors in mm" in page
+    assert "level" in page
 
 
 @pytest.mark.slow

@@ -25,6 +25,7 @@ from ..plants._uncertain import UncertainPlant, scale_gain, uncertain_plant
 from ._adaptive_runtime import AdaptiveArrays
 
 _RUNTIME_MODULE = "softneck.design.varying._adaptive_runtime"
+_UNSAID = ("integer", "display_unit", "tunable")
 _ADAPT = Port(name="adapt", description="1: learn; 0: nominal gains", start=1.0, minimum=0.0, maximum=1.0)
 # Sizes of the loop kappa z^-d / (z - 1) that are tried, 1 % apart.
 _LOOP_SIZES = np.geomspace(1e-3, 1.0, 695)
@@ -329,8 +330,8 @@ class VaryingController(ReprMixin):
             "limits": self.limits.header(),
             "order": self.order,
             "names": list(self.arrays),
-            # None of them is an integer, and files of format 1 do not say so.
-            "parameters": [{k: v for k, v in asdict(_ADAPT).items() if k not in ("integer", "display_unit")}],
+            # Files of format 1 do not say these: none is an integer or tunable.
+            "parameters": [{k: v for k, v in asdict(_ADAPT).items() if k not in _UNSAID}],
             "lines": list(self.lines),
             "design": dict(self.design),
             "inputs": [port.name for port in block.inputs],
