@@ -16,8 +16,6 @@ from .shared._options import common_options, requirements_option
 _PATH = click.Path(path_type=Path)
 # As `softneck.tuning` has it, which is imported when the command runs.
 _DEFAULT_BUDGET = 160
-# Metrics of stability and margins.
-_MARGIN_GROUPS = ("stability.", "axes.", "mimo.", "robust.")
 
 
 @click.command("tune", epilog="Example: softneck tune family.npz greybox.npz --requirements wanted.toml -o build/tune")
@@ -126,13 +124,15 @@ def way_on(binding: str | None, *, unheard: bool, blind: bool = False) -> str:
     `binding`: the active requirement; None if it is not known. `unheard`: whether the data do not support it. `blind`:
     whether the kind has no linear form to test against the data.
     """
+    from softneck.verification import MARGIN_GROUPS
+
     if blind:
         return "No setting fixes it: name kinds with a linear form in --kinds, such as pi or lqg"
     if binding is None:
         return "Continue with a larger --budget"
     if unheard:
         return "Record the data named above; no setting fixes it"
-    if binding.startswith(_MARGIN_GROUPS):
+    if binding.startswith(MARGIN_GROUPS):
         return (
             "It covers the uncertainty of the models: allow a slower rise, give a family of more recordings, or "
             "continue with a larger --budget"

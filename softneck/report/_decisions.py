@@ -5,16 +5,18 @@ Each is made of values of its command's JSON and is itself there as `decision`, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from softneck.core import SettingsError, percent, required_rows
 from softneck.plots import cell
-from softneck.verification import metric_title
+from softneck.verification import MARGIN_GROUPS, metric_title
 
 # The least simulation fits [%] with their words: `design` refuses models below 30, `identify auto` warns below 70.
 _FIT_WORDS = ((90.0, "very good"), (80.0, "good"), (70.0, "fair"), (30.0, "poor"))
+_USEFUL = _FIT_WORDS[-1][0]
 # Fits closer than this [points] are alike, as `identify auto` has it.
 _ALIKE = 0.5
 
@@ -30,7 +32,7 @@ def fit_word(fit: float | None) -> str:
 
 def beats(fit: float | None, other: float | None) -> str:
     """Return "beats", "equals" or "misses": a fit [%] beside that of a baseline; empty where one is not known."""
-    if fit is None or other is None:
+    if fit is None or other is None or math.isnan(fit) or math.isnan(other):
         return ""
     return "beats" if fit > other + _ALIKE else "misses" if fit < other - _ALIKE else "equals"
 
@@ -47,10 +49,10 @@ def list_fits(fits: Values, best_linear: Values | None = None) -> str:
 
 
 def trust_limits(ranges: Values | None, unit: str) -> str:
-    """Return where a model was never judged: "beyond pitch -17.3 to 18.2 deg"; `ranges`: output -> [low, high]."""
+    """Return where a model was never judged: "outside pitch -17.3 to 18.2 deg"; `ranges`: output -> [low, high]."""
     known = [(name, ends) for name, ends in (ranges or {}).items() if ends]
     return (
-        "beyond " + ", ".join(f"{name} {low:.3g} to {high:.3g} {unit}" for name, (low, high) in known) if known else ""
+        "outside " + ", ".join(f"{name} {low:.3g} to {high:.3g} {unit}" for name, (low, high) in known) if known else ""
     )
 
 
@@ -61,18 +63,18 @@ def auto_decision(facts: Values) -> str:
     if judged is None:
         return f"Do not use {facts['model']}: {facts['chosen']} was not judged."
     fits, linear = judged["fits"]["model"]["inf"], judged["fits"]["best_linear"].get("inf", {})
-    if judged["diverged"] is not None or min(map(_least, fits.values())) < 0.0:
+    if judged["diverged"] is not None or min(map(_least, fits.values())) < _USEFUL:
         return f"Do not use {facts['model']} ({facts['chosen']}): simulation fit {list_fits(fits, linear)}."
     said = f"Use {facts['model']} ({facts['chosen']}): on rows it has not seen it simulates {list_fits(fits, linear)}."
     limits = trust_limits(judged["measured_range"], judged.get("unit", "deg"))
     worst = "" if chosen["fit"] is None else f"Worst test: {percent(chosen['fit'])} % ({chosen['worst']})."
     return " ".join(
-        filter(None, [said, f"Do not trust it {limits}: nothing larger was judged." if limits else "", worst])
+        filter(None, [said, f"Do not trust it {limits}: it was not judged there." if limits else "", worst])
     )
 
 
 def _least(fit: float | None) -> float:
-    return float("-inf") if fit is None else fit
+    return -math.inf if fit is None or math.isnan(fit) else fit
 
 
 def validation_decision(models: Sequence[Values]) -> str:
@@ -86,7 +88,8 @@ def validation_decision(models: Sequence[Values]) -> str:
 def _best_on(data: str, rivals: Sequence[Values]) -> str:
     best = max(rivals, key=lambda one: min(map(_least, _last(one).values())))
     fits, ahead = _last(best), list(best["fits"]["model"])[-1]
-    bad = best["diverged"] is not None or min(map(_least, fits.values())) < 0.0
+    least = _USEFUL if ahead == "inf" else 0.0
+    bad = best["diverged"] is not None or min(map(_least, fits.values())) < least
     of = f", the best of {len(rivals)} models" if len(rivals) > 1 else ""
     rows = f"{best['rows_scored']} rows of {Path(data).name}"
     if ahead == "inf":
@@ -101,7 +104,7 @@ def _best_on(data: str, rivals: Sequence[Values]) -> str:
     if lost := [Path(one["model"]).name for one in rivals if one["diverged"] is not None]:
         said.append(f"Diverged: {', '.join(lost)}.")
     if (limits := trust_limits(best["measured_range"], best.get("unit", "deg"))) and not bad:
-        said.append(f"Do not trust it {limits}: nothing larger was judged.")
+        said.append(f"Do not trust it {limits}: it was not judged there.")
     return " ".join(said)
 
 
@@ -159,9 +162,10 @@ def project_decision(models: Sequence[Values], certificates: Sequence[Values], *
     failing = "; ".join(_requirement(row) for row in one["failed"][:2])
     more = f" and {len(one['failed']) - 2} more" if len(one["failed"]) > 2 else ""
     said.append(f"Do not run {name} yet: {len(one['failed'])} of {count} requirements fail: {failing}{more}.")
-    said.append(
-        f"Next: loosen these, or record another motion and start with both logs{'; ' + trade if trade else ''}."
-    )
+    # A safety margin is never loosened.
+    margins = any(str(row["metric"]).startswith(MARGIN_GROUPS) for row in one["failed"])
+    way = "allow a slower rise" if margins else "loosen these"
+    said.append(f"Next: {way}, or record another motion and start with both logs{'; ' + trade if trade else ''}.")
     return " ".join(said)
 
 

@@ -317,8 +317,9 @@ def project_verdict(project: Project) -> tuple[str, bool | None]:
     unsure = "".join(f" Not sure of {what}: {_shorten(doubts)}." for what, doubts in _doubts(project).items())
     if not parts:
         return f"{decision} No file of this project states a limit, so there is no verdict.{unsure}".lstrip(), None
-    # A file that cannot be read stops nobody.
-    good = held == len(loops) and certified == len(project.certificates)
+    # A log that needs a layout stops nobody; a certificate, model or loop that cannot be read may be one that fails.
+    damaged = [name for name in project.problems if _READERS[Path(name).suffix.lower()] is not _read_recording]
+    good = held == len(loops) and certified == len(project.certificates) and not damaged
     said = f"{'; '.join(parts)}."
     return f"{decision} {said[0].upper()}{said[1:]}{unsure}".lstrip(), good if loops or project.certificates else None
 

@@ -19,6 +19,8 @@ from ._linear import LARGE, SMALL
 from ._plants import PlantSource
 from ._steps import METRICS
 
+#: Groups of metrics of stability and margins, which nobody is told to loosen.
+MARGIN_GROUPS = ("stability.", "axes.", "mimo.", "robust.")
 # Sensor noise of the defaults.
 _NOISE_DEG = 0.05
 # Angles of every robot, independent of the unit of its outputs.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -90,14 +91,27 @@ def test_validate_decides_for_the_best_model_and_says_where_to_stop(entry: dict[
     said = validation_decision([worse, entry])
     assert said == (
         "Use m.npz, the best of 2 models: on 975 rows of log.csv it simulates flexion 77.2 % (fair, below the best "
-        "linear fit of these rows, 81.5 %), twist 93.5 % (very good). Do not trust it beyond flexion -1.25 to 17.5 mm: "
-        "nothing larger was judged."
+        "linear fit of these rows, 81.5 %), twist 93.5 % (very good). Do not trust it outside flexion -1.25 "
+        "to 17.5 mm: it was not judged there."
     )
     lost = {**worse, "diverged": 3.0}
     assert "Diverged: b.npz." in validation_decision([lost, entry])
     assert validation_decision([lost]).startswith("Do not use b.npz: ")
     other = {**entry, "data": "two.csv"}
     assert validation_decision([entry, other]).count("Use m.npz: ") == 2
+
+
+@pytest.mark.parametrize(("fit", "use"), [(30.0, "Use "), (29.9, "Do not use "), (-5.0, "Do not use "),
+                                          (math.nan, "Do not use "), (None, "Do not use ")])  # fmt: skip
+def test_a_model_that_design_would_refuse_is_not_to_be_used(entry: dict[str, Any], fit: float | None, use: str) -> None:
+    """One output decides, however good the other is; `design` refuses below 30 %."""
+    for both in ({"flexion": fit, "twist": 93.5}, {"twist": 93.5, "flexion": fit}):
+        fits = {**entry["fits"], "model": {"inf": both}}
+        assert validation_decision([{**entry, "fits": fits}]).startswith(use)
+
+
+def test_a_fit_that_is_no_number_equals_nothing() -> None:
+    assert [beats(math.nan, 1.0), beats(1.0, math.nan), beats(1.0, 1.0)] == ["", "", "equals"]
 
 
 def test_ahead_is_judged_beside_the_last_sample(entry: dict[str, Any]) -> None:
@@ -154,9 +168,12 @@ def test_a_project_decides_on_model_controller_and_next_step() -> None:
         assert said == (
             "Use a.npz (nn): on rows it has not seen it simulates x 99.0 % (very good), y 99.0 % (very good). Do not "
             "run tune/best.npz (hinf) yet: 3 of 4 requirements fail: rise time, simulation 0.444, required at most "
-            "0.4; gain margin, worst axis not computed, required at least 2.5 (no plant) and 1 more. Next: loosen "
-            "these, or record another motion and start with both logs."
+            "0.4; gain margin, worst axis not computed, required at least 2.5 (no plant) and 1 more. Next: allow a "
+            "slower rise, or record another motion and start with both logs."
         )
+    # One that is no margin may be loosened.
+    rise = certificate_values("z.json", {**certificate(3), "requirements": certificate(3)["requirements"][:1]})
+    assert "Next: loosen these, or record" in project_decision([], [rise], tuner=None)
     unknown = certificate_values("z.json", {**certificate(3), "requirements": certificate(3)["requirements"][2:3]})
     assert "sim.of_another_version 2, required at most 1." in project_decision([], [unknown], tuner=None)
     assert project_decision([], [], tuner=None) == ""
