@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from softneck.core import SettingsError
 from softneck.fmu import FmuInfo, build_fmu, fmu_info
 from softneck.fmu.python import _build
 from softneck.identification import OutputError, Rls, validate
+from tests.design.test_robots import BELLOWS, DELAY, TS, plant
 
 from ..data import slow_but
 from .every_kind import FAMILIES, KINDS, SHORT, block_of, recording
@@ -54,6 +56,14 @@ def test_scores_of_a_validation_are_shown(tmp_path: Path) -> None:
 @pytest.mark.parametrize("settings", [Rls(delay=0.06), OutputError(delay=0.06)])
 def test_the_dead_time_that_was_given_is_the_one_that_is_said(settings: Any) -> None:
     assert "; dead time 0.06 s" in fmu_info(settings.fit(recording())).description
+
+
+@pytest.mark.parametrize("kind", ["rls", "oe"])
+def test_the_dead_time_of_another_robot_is_no_flag_beside_it(kind: str) -> None:
+    """Models with learned directions are in state space, whose array `delay` holds a flag too."""
+    said = fmu_info(replace(plant(BELLOWS), kind=kind)).description
+    assert said.startswith("plant: 4 motor set-points [bar] -> x, y, z [mm]; ")
+    assert f"; dead time {DELAY * TS:.3g} s" in said
 
 
 def test_a_plant_says_what_it_is_with_its_held_out_fit() -> None:

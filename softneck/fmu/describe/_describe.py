@@ -144,8 +144,8 @@ _KIND_LIMITS = {
 
 # Of the default experiment: 10 s of the neck.
 _SHOWN_SAMPLES = 500
-# Kind -> the entries of its array `delay` that are dead times [samples].
-_DEAD_TIMES = {"rls": slice(None), "oe": slice(1)}
+# Kinds whose array `delay` holds dead times [samples].
+_WITH_DEAD_TIME = ("rls", "oe")
 
 
 class Buildable(Protocol):
@@ -252,11 +252,13 @@ def fmu_info(
 def _model_line(model: Model, block: Block) -> str:
     """Return what a model is, in one line: signals with units, method, sample time, dead time, fit."""
     robot = model.robot
-    delays = np.ravel(model.arrays["delay"])[_DEAD_TIMES[model.kind]] if model.kind in _DEAD_TIMES else np.zeros(0)
+    delays = np.ravel(model.arrays["delay"]) if model.kind in _WITH_DEAD_TIME else np.zeros(0)
+    # In state space the first is the dead time of all outputs, and a flag stands beside it.
+    delays = delays[:1] if "K" in model.arrays else delays
     dead = "/".join(f"{d * model.sample_time:.3g}" for d in sorted(set(delays)))
     fits = model.findings.get("hold_out", {}).get("fit", {})
     said = [
-        f"plant: {len(robot.set_points)} motor set-points [{robot.motors.unit}] -> "
+        f"plant: {len(robot.set_points)} motor set-point{'s' * (len(robot.set_points) > 1)} [{robot.motors.unit}] -> "
         f"{', '.join(robot.outputs.names)} [{robot.outputs.display_unit}]",
         _without_sources(KINDS[model.kind].summary, block),
         f"{1e3 * model.sample_time:g} ms",
