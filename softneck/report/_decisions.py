@@ -120,7 +120,7 @@ def model_values(file: str, model: Any) -> dict[str, Any]:
 
 
 def certificate_values(file: str, content: Values) -> dict[str, Any]:
-    """Return the JSON values of a certificate in a project: of which controller, and which requirements fail."""
+    """Return the JSON values of a certificate in a project: its controller, what fails, what does not decide."""
     rows = required_rows(content)
     controller = content.get("files", {}).get("controller", {}).get("path", "")
     failed = [
@@ -130,7 +130,8 @@ def certificate_values(file: str, content: Values) -> dict[str, Any]:
     ]
     return {"file": file, "of": str(content.get("certificate")), "controller": str(controller),
             "kind": str(content.get("controller_kind", "")), "holds": bool(content.get("holds")) and bool(rows),
-            "requirements": len(rows), "failed": failed}  # fmt: skip
+            "requirements": len(rows), "failed": failed,
+            "undecided": [str(row["metric"]) for row in rows if row.get("holds") is None]}  # fmt: skip
 
 
 def project_decision(models: Sequence[Values], certificates: Sequence[Values], *, tuner: str | None) -> str:
@@ -156,8 +157,16 @@ def project_decision(models: Sequence[Values], certificates: Sequence[Values], *
         "" if tuner is None else f"open {tuner} to trade speed for caution",
     )
     if one["holds"]:
-        said.append(f"{name} holds all {count} requirements of {one['file']}.")
-        said.append(f"Next: run it on drives with that certificate{', or ' + trade if trade else ''}.")
+        undecided = one["undecided"]
+        holds = f"{count - len(undecided)} of {count}" if undecided else f"all {count}"
+        rest = f"; {len(undecided)} do not decide" if undecided else ""
+        said.append(f"{name} holds {holds} requirements of {one['file']}{rest}.")
+        # Slack is known of plants with tensions alone, and other robots have no tendons.
+        if any(metric.startswith("sim.") and metric != "sim.slack_s" for metric in undecided):
+            way = "verify it over a simulation model of this robot too, or over a family with draws"
+        else:
+            way = "run it on drives with that certificate"
+        said.append(f"Next: {way}{', or ' + trade if trade else ''}.")
         return " ".join(said)
     failing = "; ".join(_requirement(row) for row in one["failed"][:2])
     more = f" and {len(one['failed']) - 2} more" if len(one["failed"]) > 2 else ""

@@ -428,7 +428,8 @@ def _certifies(content: Mapping[str, Any]) -> bool:
 
 def _requirement(name: str, row: Mapping[str, Any]) -> list[str]:
     held = row.get("holds", False)
-    verdict = "holds" if held else "not computed" if held is None else "fails"
+    unknown = "not computed" if row.get("value") is None else "does not decide"
+    verdict = "holds" if held else unknown if held is None else "fails"
     return [name, str(row.get("metric", "")), cell(row.get("value")), cell(row.get("limit")), verdict]
 
 

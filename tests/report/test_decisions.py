@@ -161,6 +161,14 @@ def test_a_project_decides_on_model_controller_and_next_step() -> None:
         "tune/best.npz (hinf) holds all 1 requirements of best.certificate.json. Next: run it on drives with that "
         "certificate, or open tune/tuner.html to trade speed for caution."
     )
+    # What does not decide is not held; loops over no model of the robot are not enough for drives.
+    for metric, way in (("sim.rise_s", "Next: verify it over a simulation model"), ("axes.sensitivity", "Next: run")):
+        rows = [*certificate(0)["requirements"], {"metric": metric, "value": 0.4, "limit": 0.5, "holds": None}]
+        said = project_decision(
+            [], [certificate_values("c.json", {**certificate(0), "requirements": rows})], tuner=None
+        )
+        assert "holds 1 of 2 requirements of c.json; 1 do not decide." in said
+        assert way in said
     # The certificate that fails decides, wherever it is in the list.
     failed = certificate_values("z.json", certificate(3))
     for both in ([*held, failed], [failed, *held]):
