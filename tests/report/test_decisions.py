@@ -162,7 +162,8 @@ def test_a_project_decides_on_model_controller_and_next_step() -> None:
         "certificate, or open tune/tuner.html to trade speed for caution."
     )
     # What does not decide is not held; loops over no model of the robot are not enough for drives.
-    for metric, way in (("sim.rise_s", "Next: verify it over a simulation model"), ("axes.sensitivity", "Next: run")):
+    for metric, way in (("sim.rise_s", "Next: verify it over a simulation model"), ("sim.slack_s", "Next: run"),
+                        ("axes.sensitivity", "Next: run")):  # fmt: skip
         rows = [*certificate(0)["requirements"], {"metric": metric, "value": 0.4, "limit": 0.5, "holds": None}]
         said = project_decision(
             [], [certificate_values("c.json", {**certificate(0), "requirements": rows})], tuner=None

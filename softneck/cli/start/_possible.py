@@ -142,9 +142,10 @@ def _rest(robot: Robot, recordings: Sequence[Recording]) -> tuple[dict[str, Entr
     set_points = np.concatenate([recording.set_points for recording in recordings])
     if robot.tendon_angles is not None or (set_points.min() < 0.0 < set_points.max()):
         return {}, {}
-    means = np.mean(set_points, axis=0), np.nanmean(np.concatenate([part.outputs for part in recordings]), axis=0)
-    if not np.isfinite(means[1]).all():
+    outputs = np.concatenate([part.outputs for part in recordings])
+    if not np.isfinite(outputs).any(axis=0).all():
         return {}, {}
+    means = np.mean(set_points, axis=0), np.nanmean(outputs, axis=0)
     units = to_si(robot.motors.unit)[0], to_si(robot.outputs.unit)[0]
     why = "the mean of the recordings: steps of tests start there"
     found = [[_digits(value / unit) for value in mean] for mean, unit in zip(means, units, strict=True)]
