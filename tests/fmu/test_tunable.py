@@ -163,21 +163,25 @@ class _Textbook:
         return self.T_inverse @ np.array([v, rest[1], rest[2]])
 
 
+def _driven(fmu: Any, change: dict[str, float]) -> Matrix:
+    """Return the loop of a running FMU whose gains change on the way."""
+    fmu.begin(use_motor_positions=1.0)
+
+    def step(k: int, signals: dict[str, float]) -> Vector:
+        fmu.set(**signals)
+        fmu.fmu.doStep(k * TS, TS)
+        return np.array(fmu.get(*MOTORS))
+
+    return _loop(type("C", (), {"step": staticmethod(step)}), lambda: fmu.set(**change))
+
+
 def _in_c(kind: str, folder: Path, running: Any, fmi: int, change: dict[str, float]) -> Matrix:
     """Return the loop of the compiled FMU in fmpy."""
     path = folder / f"C{fmi}.fmu"
     build_compiled_fmu(block_of(kind), path, fmi=fmi)
     if fmi == 2:
         with running(path) as fmu:
-            fmu.begin(use_motor_positions=1.0)
-
-            def step(k: int, signals: dict[str, float]) -> Vector:
-                fmu.set(**signals)
-                fmu.fmu.doStep(k * TS, TS)
-                return np.array(fmu.get(*MOTORS))
-
-            controller = type("C", (), {"step": staticmethod(step)})
-            return _loop(controller, lambda: fmu.set(**change))
+            return _driven(fmu, change)
     with unpacked(path) as resources:
         model = fmpy.read_model_description(str(resources))
         at = {v.name: v.valueReference for v in model.modelVariables}
@@ -238,14 +242,7 @@ def test_what_is_tunable_may_be_set_while_running(build: Any, tmp_path: Path, ru
     assert [name for name, v in variables.items() if v.variability == "tunable"] == gains
     change, plain = _changed("pi"), _Plain(_block("pi"))
     with running(path) as fmu:
-        fmu.begin(use_motor_positions=1.0)
-
-        def step(k: int, signals: dict[str, float]) -> Vector:
-            fmu.set(**signals)
-            fmu.fmu.doStep(k * TS, TS)
-            return np.array(fmu.get(*MOTORS))
-
-        seen = _loop(type("C", (), {"step": staticmethod(step)}), lambda: fmu.set(**change))
+        seen = _driven(fmu, change)
         np.testing.assert_allclose(seen, _loop(plain, lambda: plain.set(**change)), rtol=0, atol=1e-12)
         assert fmu.get("pitch_K") == [change["pitch_K"]]
         with pytest.raises(FMICallException):
