@@ -295,7 +295,8 @@ def look_ahead_error(
 
     Five of every 25 samples are withheld from the filter. Likelihood favours levels that trust every measurement where
     the model is wrong; the gaps and the prediction over the sensor's delay (`late` [s]; None: the filter's) show the
-    price. Outliers are not compared. Rows should be others than the noise levels were fitted to.
+    price. Outliers are not compared. Rows should be others than the noise levels were fitted to. Returns inf if an
+    estimate is no finite number.
     """
     late = (observer.lead if late is None else late) / observer.sample_time
     names = measured_names(recording)
@@ -311,11 +312,12 @@ def look_ahead_error(
         # The measurement `late` samples later, interpolated linearly.
         whole, part = int(late), late - int(late)
         ahead = [np.vstack([clean[n:], np.full((n, clean.shape[1]), np.nan)])[: len(clean)] for n in (whole, whole + 1)]
-        error = estimates - (ahead[0] if part == 0.0 else (1.0 - part) * ahead[0] + part * ahead[1])
+        later = ahead[0] if part == 0.0 else (1.0 - part) * ahead[0] + part * ahead[1]
         # Without a delay the filter has seen every measurement outside the gaps.
-        counted = (gap if late < 1.0 else row >= SETTLE) & np.isfinite(error).all(axis=1)
-        squares.append(error[counted] ** 2 if gap.any() else error[:0])
+        counted = (gap if late < 1.0 else row >= SETTLE) & np.isfinite(later).all(axis=1)
+        squares.append((estimates - later)[counted] ** 2 if gap.any() else later[:0])
     judged = np.concatenate(squares)
     if not judged.size:
         raise DataError(f"runs of more than {SETTLE + _GAP_PERIOD} rows are needed to check a filter; record longer.")
-    return float(np.sqrt(judged.mean()))
+    # A filter that diverged has no error to compare.
+    return float(np.sqrt(judged.mean())) if np.isfinite(judged).all() else float("inf")

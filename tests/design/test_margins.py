@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import control
@@ -12,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softneck.core import SettingsError
-from softneck.design import Margins, PiSettings, loop_margins, margins_of_loops
+from softneck.design import Margins, PiSettings, loop_margins, margins_of_loops, uncertain_plant
 from softneck.design.linear._margins import frequency_grid
+from softneck.estimation import LinearNeck
 
 
 def response(L: Any, w: np.ndarray) -> np.ndarray:
@@ -247,3 +249,26 @@ def test_a_design_says_what_its_margins_are_of() -> None:
         margins = [line.strip() for line in text if "gain margin" in line and "small moves" not in line]
         assert len(margins) == 2 * len(lines)
         assert all(line.startswith(start) for line, start in zip(margins, 2 * lines, strict=True))
+
+
+def test_margins_of_a_family_come_with_the_band_of_its_recordings() -> None:
+    """A loop that crosses above what the recordings support has margins of the models alone, and says so."""
+    G: Any = control.TransferFunction([0.01], [1.0, -0.9, 0.0, 0.0], 0.02)
+    plain = uncertain_plant({"pitch": [G, 1.1 * G], "roll": [G, 1.1 * G]})
+    assert "the band of its recordings is not known" in PiSettings().design(plain).summary()
+    crossover = PiSettings().design(plain).design["pitch"]["margins_family"]["crossover"]
+    for high, above in ((1.001 * crossover, False), (0.999 * crossover, True)):
+        axes = {name: replace(axis, band=(0.1, high)) for name, axis in plain.axes.items()}
+        text = PiSettings().design(replace(plain, axes=axes)).summary()
+        assert text.count(f"its recordings support 0.1 to {high:.3g} rad/s") == 2
+        assert text.count("the crossover is above: these margins are of the models alone") == 2 * above
+
+
+def test_a_family_gives_its_band_to_each_axis() -> None:
+    class Known(LinearNeck):
+        def band(self, output: str) -> tuple[float, float]:
+            return {"pitch": (0.1, 20.0), "roll": (0.2, 30.0)}[output]
+
+    G: Any = control.TransferFunction([0.01], [1.0, -0.9, 0.0, 0.0], 0.02)
+    assert {name: axis.band for name, axis in uncertain_plant(Known(pitch=G, roll=G)).axes.items()} == {
+        "pitch": (0.1, 20.0), "roll": (0.2, 30.0)}  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import control
@@ -245,3 +246,12 @@ def test_default_payloads_go_to_the_heaviest_recorded_one_and_stated_ones_stay(
     stated = make_tune_requirements({"sim": {"payloads_kg": [0.7]}}, payload=payload)
     assert stated.certificate.sim["payloads_kg"] == [0.7]
     assert ("sim.payloads_kg" in stated.stated, "sim.payloads_kg" in asked.stated) == (True, False)
+
+
+def test_settling_is_judged_by_the_sensor_up_to_the_noise_that_fits_the_band() -> None:
+    """Four standard deviations within 5 % of the step, the limit itself included; a NaN shows nothing."""
+    for noise, size, part, shown in ((0.125, 10.0, 1.0, True), (0.1250001, 10.0, 1.0, False), (0.0625, 10.0, 0.5, True),
+                                     (0.0625001, 10.0, 0.5, False), (math.nan, 10.0, 1.0, False)):  # fmt: skip
+        found = make_tune_requirements({"sim": {"size_deg": size}})
+        asked = replace(found, track={**found.track, "noise_deg": noise})
+        assert asked.shows_settling(part) == shown

@@ -256,6 +256,7 @@ class LinearController(ReprMixin):
             lines += _findings(item)
             if "margins_family" in item:
                 lines.append(f"    worst of its {item['family']} plants: {_margins(item['margins_family'])}")
+                lines += _band_lines(item)
             for title, key in (("", "margins"), (", small moves", "margins_small_moves")):
                 if key in item and (key == "margins" or item[key] != item.get("margins")):
                     lines.append(f"    nominal model only{title}: {_margins(item[key])}")
@@ -336,6 +337,17 @@ def _findings(item: Mapping[str, Any]) -> list[str]:
     if "gamma" in item:
         lines.append(f"    gamma {item['gamma']:.4g}")
     return lines
+
+
+def _band_lines(item: Mapping[str, Any]) -> list[str]:
+    """Return in words the band of the recordings, and whether the loop crosses above it."""
+    if (band := item.get("band_rad_s")) is None:
+        return ["    the band of its recordings is not known: `softneck family` finds it"]
+    crossover = item["margins_family"].get("crossover")
+    known = f"    its recordings support {band[0]:.3g} to {band[1]:.3g} rad/s"
+    if crossover is None or crossover <= band[1]:
+        return [known]
+    return [f"{known}; the crossover is above: these margins are of the models alone"]
 
 
 def _margins(values: Mapping[str, float | None]) -> str:

@@ -273,6 +273,8 @@ class AxisSettings(LoopSettings, ABC):
         }
         if axis.family > 1:
             findings |= {"family": axis.family, "margins_family": margins_json(worst)}
+        if axis.band is not None:
+            findings["band_rad_s"] = list(axis.band)
         return controller, led, findings
 
     def _require_stable(self, controller: AxisController, axis: UncertainAxis) -> None:

@@ -165,7 +165,8 @@ class UncertainAxis:
 
     `nominal`: the plant that synthesis takes. `samples`: every plant that the controller must hold on; the nominal one
     is the first. `test`: what a controller is judged by on all of them; None where nobody judges. `uncertainty`: what
-    is allowed for besides. `family`: how many plants were given, 1 for a model alone.
+    is allowed for besides. `family`: how many plants were given, 1 for a model alone. `band`: lowest and highest
+    frequency [rad/s] that their recordings support; None where it is not known.
     """
 
     nominal: AxisPlant
@@ -173,6 +174,7 @@ class UncertainAxis:
     test: StepAndLoad | None = None
     uncertainty: ModelUncertainty = _NO_UNCERTAINTY
     family: int = 1
+    band: tuple[float, float] | None = None
 
     @property
     def sample_time(self) -> float:
@@ -308,6 +310,8 @@ def uncertain_plant(source: Any, robot: Robot | None = None) -> UncertainPlant:
         )
     robot = robot_of(source)
     joined = _combine_axes({axis: _of_model(source, axis) for axis in robot.outputs.names})
+    if callable(band := getattr(source, "band", None)):
+        joined = replace(joined, axes={axis: replace(item, band=band(axis)) for axis, item in joined.axes.items()})
     return replace(joined, robot=robot, weights=directions_of(source))
 
 

@@ -32,17 +32,20 @@ from softneck.identification.validation._error_statistics import (
 )
 from softneck.identification.validation._score_tables import (
     INFINITE,
+    RANGES,
     Rows,
     _block_sums,
     coverage_tables,
     divergence,
     fit_intervals,
     interval_tables,
+    outside_table,
     score_tables,
 )
-from softneck.robot import Robot
+from softneck.robot import Robot, Scaling
 
 from ...data import ROOT, neck_recording
+from ...laws.worlds import View, world
 from ...order import is_worse
 
 SCORES: dict[str, Callable[..., float]] = {
@@ -191,6 +194,38 @@ def test_three_ranges_from_the_middle_are_gone_and_an_angle_at_half_a_turn_as_we
         at = wide.copy()
         at[20, 0] = value
         assert divergence(rows_of(wide), at) == [pytest.approx(expected) if expected else None]
+
+
+@pytest.mark.parametrize("unit", [1e-3, 50.0])
+def test_a_simulation_leaves_after_as_many_ranges_in_any_unit(unit: float) -> None:
+    """The least range is of the scaled outputs: a robot of millimetres and one of tens of metres are told alike."""
+    plain = world("arm", View()).robot
+    nominal = (unit * 0.2, unit * 0.4)
+    robot = replace(plain, outputs=replace(plain.outputs, nominal=nominal, min=None, max=None))
+    scaled = Scaling.of(robot).output_unit
+    for width in (0.6, 0.01):
+        y = np.outer(np.linspace(-1.0, 1.0, 50), 0.5 * width * scaled)
+        rows = replace(rows_of(y), robot=robot)
+        reach = RANGES * max(width, np.radians(5.0))
+        for share, expected in ((0.999, None), (1.001, rows.time[20])):
+            at = y.copy()
+            at[20, 1] = share * reach * scaled[1]
+            assert divergence(rows, at) == [expected]
+
+
+def test_rounding_of_a_set_point_is_not_outside_the_trained_range() -> None:
+    y, _ = signals(200)
+    least, most = np.array([-1.0, 0.0, -3.0]), np.array([1.0, 4.0, 3.0])
+    model: Any = SimpleNamespace(
+        kind="rls", robot=Robot.preset(),
+        findings={"set_points_rad": {"min": least.tolist(), "max": most.tolist()}},
+    )  # fmt: skip
+    for share, outside in ((0.5e-6, 0.0), (2e-6, 50.0)):
+        for end, sign in ((most, 1.0), (least, -1.0)):
+            U = np.tile(0.5 * (least + most), (200, 1))
+            U[::2, 1] = end[1] + sign * share * (most[1] - least[1])
+            found = outside_table(model, replace(rows_of(y), set_points=U), y)
+            assert found == {"pitch": outside, "roll": outside}
 
 
 # -- bounds -----------------------------------------------------------------------------------------------------------
