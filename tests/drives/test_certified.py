@@ -166,6 +166,17 @@ def test_a_loop_certificate_covers_each_file_for_the_whole_run(project: Project,
         require_certified(setup, project.controller, [short])
 
 
+def test_a_certificate_without_a_duration_covers_no_run_however_short(project: Project, tmp_path: Path) -> None:
+    path = project.write_loop("brief.toml", STEP, 0.5)
+    setup, certificate = load_loop(path), tmp_path / "brief.json"
+    write_certificate(certificate, simulate(setup).certificate())
+    require_certified(setup, project.controller, [certificate])
+    for number, duration in enumerate((None, 0.0, "nan")):
+        short = edited(certificate, tmp_path / f"{number}.json", duration_s=duration)
+        with pytest.raises(CheckFailedError, match=r"is for (0|nan) s, the run takes 0\.5 s"):
+            require_certified(setup, project.controller, [short])
+
+
 def test_a_loop_certificate_covers_the_drives_file(project: Project) -> None:
     drives = project.folder / "my_drives.toml"
     drives.write_text(DRIVES, encoding="utf-8")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from softneck.core import CheckFailedError, SettingsError
 from softneck.drives import default_drives
+from softneck.drives.bus._link import VirtualLink
 from softneck.drives.bus._objects import CSP, GUARDING_OBJECTS, HOMED_MARK, Write
 from softneck.drives.bus._sdo import SdoError
 from softneck.drives.logs._result import CycleTimes
@@ -537,6 +539,33 @@ def test_in_real_time_each_cycle_reads_asks_steps_sends_and_keeps_its_pace(monke
     assert line.sent == [[k] for k in (5, 4, 3, 2, 1, 0)]
     assert seen[:3] == [("take", ["frame"]), ("watch", [5], None), ("watch", [4], tilt)]
     assert times.count == 5
+
+
+def test_the_keyboard_is_the_operator_where_none_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened, ran = list[str](), list[Any]()
+
+    class Keys:
+        def __enter__(self) -> Keys:
+            opened.append("keyboard")
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            opened.append("closed")
+
+    monkeypatch.setattr(_bus_loop, "Keyboard", Keys)
+    monkeypatch.setattr(_bus_loop, "steady", nullcontext)
+    monkeypatch.setattr(_bus_loop, "_run_session", lambda session, *_: ran.append((session.operator, *opened)))
+    other: Any = SimpleNamespace()
+    for simulated, operator in ((False, None), (False, other), (True, None)):
+        opened.clear()
+        link: Any = object.__new__(VirtualLink) if simulated else other
+        session = Session(link=link, file=FILE, operator=operator)
+        _bus_loop.run_session(session, other, sample_time=0.02, most=1.0)
+    keys, given, alone = ran
+    assert isinstance(keys[0], Keys)
+    assert keys[1:] == ("keyboard",)
+    assert given == (other,)
+    assert alone == (None,)
 
 
 def test_an_operator_is_asked_in_every_cycle(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from softneck.verification._experiments import (
     _scan_group,
     crossing_values,
     crossings,
+    scale_loop_gain,
 )
 from softneck.verification._linear import LinearLaw, margins
 from softneck.verification._plants import Plants, all_plants, source_of_family
@@ -220,3 +222,34 @@ def test_a_quieter_loop_oscillates_by_more_than_what_late_axes_do_to_each_other(
         monkeypatch.setattr(Experiment, "_windows", lambda *_, size=size: (size * _SMALL_RAD, size * _SMALL_RAD))
         assert Experiment(loop, "both", "gain_down", _SMALL_RAD, (0.0, 0.0)).oscillates(1.4, 0.0) is loud
         assert Experiment(loop, "both", "gain_up", _SMALL_RAD, (0.0, 0.0)).oscillates(1.4, 0.0)
+
+
+def test_each_channel_is_late_louder_and_disturbed_by_its_own_numbers() -> None:
+    """Against the definition written out: a line between samples, and d[k+1] = keep d[k] + share dy[k] n[k]."""
+    controller = pi().block()
+    block, _ = scale_loop_gain(controller, None)
+    part, axes = BlockPart(block), ("pitch", "roll")
+    rng = np.random.default_rng(3)
+    y, r = rng.standard_normal((20, 2)), rng.standard_normal((20, 2))
+    gains, delays = (1.5, 0.7), (3.25, 2.0)
+    told = {f"gain_{a}": g for a, g in zip(axes, gains, strict=True)}
+    told |= {f"delay_{a}": d for a, d in zip(axes, delays, strict=True)}
+    part.start(0.0, told)
+    names = [port.name for port in block.inputs]
+    for k in range(20):
+        values = {f"{a}_measured": y[k, i] for i, a in enumerate(axes)}
+        values |= {f"{a}_reference": r[k, i] for i, a in enumerate(axes)}
+        seen = part.step(k * TS, np.array([values[name] for name in names]))
+        for i in (0, 1):
+            past = np.concatenate([np.zeros(10), (y - r)[: k + 1, i]])
+            late = np.interp(len(past) - 1 - delays[i], np.arange(len(past)), past)
+            # Rounding of three operations on numbers of size one.
+            assert seen[i] == pytest.approx(r[k, i] + gains[i] * late, abs=1e-14)
+    # The disturbance alone: without motion nothing, and it fades by `keep`.
+    part.start(0.0, {"gain_pitch": 0.0, "gain_roll": 0.0, "share_pitch": 0.3, "keep": 0.9, "noise_seed": 1.0})
+    still = [0.2, 0.0, 0.0, 0.0]
+    moved = [part.step(k * TS, np.array(still)).copy() for k in range(4)]
+    assert moved[0][0] != 0.0
+    for before, after in pairwise(moved):
+        assert after[0] == pytest.approx(0.9 * before[0], rel=1e-12)
+        assert after[1] == 0.0
