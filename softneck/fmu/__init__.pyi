@@ -14,4 +14,5 @@ from .compiled._model_file import node_of as node_of
 from .describe._describe import Buildable as Buildable
 from .describe._describe import buildable as buildable
 from .describe._describe import has_keys as has_keys
+from .describe._description import LIMIT_OUTPUTS as LIMIT_OUTPUTS
 from .describe._description import exported_block as exported_block

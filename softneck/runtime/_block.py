@@ -25,7 +25,7 @@ class Port:
         start: value before anything is set.
         minimum, maximum, nominal: as in FMI; None where there is none.
         boolean: a Boolean, carried as 0.0 or 1.0.
-        integer: a whole number; Int64 in FMI 3.0, Real in FMI 2.0.
+        integer: a whole number; Int32 in FMI 3.0, Integer in FMI 2.0.
         missing: NaN is allowed and means "not measured".
         tunable: a parameter that may change during a run.
         display_unit: unit in tools; "": the usual one for `unit`.

@@ -30,17 +30,24 @@ class Running:
     fmu: FMU2Slave
     references: dict[str, int]
     booleans: set[str]
+    integers: set[str] = field(default_factory=set)
     log: list[tuple[int, str]] = field(default_factory=list)
 
     def set(self, **values: float) -> None:
         for name, value in values.items():
             if name in self.booleans:
                 self.fmu.setBoolean([self.references[name]], [int(value)])
+            elif name in self.integers:
+                self.fmu.setInteger([self.references[name]], [int(value)])
             else:
                 self.fmu.setReal([self.references[name]], [value])
 
     def get(self, *names: str) -> list[float]:
-        take = {name: self.fmu.getBoolean if name in self.booleans else self.fmu.getReal for name in names}
+        kinds = {"booleans": self.fmu.getBoolean, "integers": self.fmu.getInteger}
+        take = {
+            name: next((f for kind, f in kinds.items() if name in getattr(self, kind)), self.fmu.getReal)
+            for name in names
+        }
         return [float(take[name]([self.references[name]])[0]) for name in names]
 
     def begin(self, start: float = 0.0, **parameters: float) -> None:
@@ -62,7 +69,8 @@ def _running(path: Path) -> Iterator[Running]:
             instanceName="test",
         )
         references = {v.name: v.valueReference for v in model.modelVariables}
-        running = Running(fmu, references, {v.name for v in model.modelVariables if v.type == "Boolean"})
+        kinds = [{v.name for v in model.modelVariables if v.type == kind} for kind in ("Boolean", "Integer")]
+        running = Running(fmu, references, *kinds)
         callbacks = fmi2CallbackFunctions()
         callbacks.logger = fmi2CallbackLoggerTYPE(
             lambda _e, _i, status, _c, text: running.log.append((status, text.decode()))

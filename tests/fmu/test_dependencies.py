@@ -40,7 +40,7 @@ class Running3(Running):
     def set(self, **values: float) -> None:
         for name, value in values.items():
             if name == "noise_seed":
-                self.fmu.setInt64([self.references[name]], [int(value)])
+                self.fmu.setInt32([self.references[name]], [int(value)])
             elif name in self.booleans:
                 self.fmu.setBoolean([self.references[name]], [bool(value)])
             else:

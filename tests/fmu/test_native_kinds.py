@@ -161,8 +161,8 @@ def _run3(folder: Path, block: Block, u: np.ndarray) -> np.ndarray:
     return seen
 
 
-def test_a_seed_is_an_integer_in_fmi3(tmp_path: Path, running: Any) -> None:
-    """Int64 there, Real in FMI 2.0 as it always was; the same noise out of both."""
+def test_a_seed_is_an_integer(tmp_path: Path, running: Any) -> None:
+    """Int32 in FMI 3.0, Integer in FMI 2.0; the same noise out of both."""
     block, noise = block_of("rls"), [port.name for port in block_of("rls").parameters].index("noise_std")
     first = len(block.inputs) + len(block.outputs)
     for fmi in (2, 3):
@@ -174,19 +174,19 @@ def test_a_seed_is_an_integer_in_fmi3(tmp_path: Path, running: Any) -> None:
     with unpacked(tmp_path / "Rls3.fmu") as folder:
         model = fmpy.read_model_description(str(folder))
         seed = next(v for v in model.modelVariables if v.name == "noise_seed")
-        assert (seed.type, seed.start, seed.min, seed.max) == ("Int64", "0", "0", "2147483647")
+        assert (seed.type, seed.start, seed.min, seed.max) == ("Int32", "0", "0", "2147483647")
         fmu = FMU3Slave(guid=model.guid, unzipDirectory=str(folder), modelIdentifier="Rls3", instanceName="three")
         fmu.instantiate()
         fmu.setFloat64([first + noise], [0.1])
-        fmu.setInt64([seed.valueReference], [7])
+        fmu.setInt32([seed.valueReference], [7])
         fmu.enterInitializationMode(startTime=0.0)
         fmu.exitInitializationMode()
         fmu.doStep(currentCommunicationPoint=0.0, communicationStepSize=TS)
-        assert list(fmu.getInt64([seed.valueReference])) == [7]
+        assert list(fmu.getInt32([seed.valueReference])) == [7]
         assert list(fmu.getFloat64([len(block.inputs), len(block.inputs) + 1])) == expected
         for wrong in (first + noise, seed.valueReference + 100):  # a Float64, and no variable at all
             with pytest.raises(FMICallException):
-                fmu.getInt64([wrong])
+                fmu.getInt32([wrong])
         fmu.freeInstance()
     assert 0.0 not in expected
 

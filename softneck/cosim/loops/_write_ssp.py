@@ -308,8 +308,8 @@ def _component(name: str, part: Part, source: Path, loop: Loop | System, wiring:
 
 
 def _parameters(part: Part) -> tuple[Port, ...]:
-    if isinstance(part, BlockPart):  # becomes an FMU of FMI 2.0, with whole numbers as Real
-        return tuple(replace(port, integer=False) for port in exported_block(part.block).parameters)
+    if isinstance(part, BlockPart):
+        return exported_block(part.block).parameters
     return getattr(part, "parameters", ())
 
 

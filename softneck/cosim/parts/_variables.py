@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import FileFormatError, SettingsError, error_reason
-from softneck.fmu import node_of, unpacked
+from softneck.fmu import LIMIT_OUTPUTS, node_of, unpacked
 from softneck.runtime import Block, Port, bundle, compiled_name
 
 if TYPE_CHECKING:
@@ -241,5 +241,6 @@ def _read_block(path: Path, folder: Path, description: Description) -> Block:
     return Block(
         kind=facts["kind"], role=facts["role"], runtime=runtime, sample_time=facts["sample_time"], arrays=arrays,
         inputs=description.ports("input"), outputs=description.ports("output"),
-        parameters=description.ports("parameter"),
+        # The FMU's own parameter is none of the block's.
+        parameters=tuple(port for port in description.ports("parameter") if port.name != LIMIT_OUTPUTS),
     )  # fmt: skip

@@ -15,7 +15,14 @@ from softneck.core import SettingsError, as_path, atomic_write, refuse_existing
 from softneck.runtime import Block, Port, TangentError, bundle, with_tangent
 
 from ..describe._describe import Buildable, FmuInfo, block_and_info, documentation_page
-from ..describe._description import Identity, exported_block, model_description, motor_positions, terminals_file
+from ..describe._description import (
+    Identity,
+    exported_block,
+    model_description,
+    motor_positions,
+    terminals_file,
+    with_limit_outputs,
+)
 from ..python._build import check_block, generation_date, license_text, model_name
 from ..python._zip import write_zip
 from ._compilers import PLATFORMS
@@ -71,7 +78,7 @@ def build_compiled_fmu(
     check_block(block)
     if fmi not in FMI_VERSIONS:
         raise SettingsError(f"unknown FMI version {fmi}; use 2 or 3.")
-    block = exported_block(block)
+    block = with_limit_outputs(exported_block(block))
     ahead = next_outputs(block) if sensitivities else ()
     modules = node_of(block.runtime, block.arrays).modules
     library = find_library(modules, sensitivities=True) if ahead else find_library(modules)

@@ -77,6 +77,7 @@ _NO_UNIT = ("", "1")
 _TIME_NAME = "time"
 # SI unit -> usual display unit, factor to it.
 _SHOWN = {"rad": ("deg", 180.0 / math.pi), "rad/s": ("deg/s", 180.0 / math.pi), "m": ("mm", 1e3)}
+LIMIT_OUTPUTS = "limit_outputs"
 TERMINALS = "terminalsAndIcons/terminalsAndIcons.xml"
 _TERMINALS = {
     "motors": "Set-points and positions of the motors",
@@ -110,6 +111,16 @@ def exported_block(block: Block) -> Block:
     """Return `block` as in its FMU: with tunable gains, a model of the drives, a range of references."""
     whole = with_modelled_drives(with_tunable_parameters(block))
     return replace(whole, inputs=tuple(_with_reference_range(port) for port in whole.inputs))
+
+
+def with_limit_outputs(block: Block) -> Block:
+    """Add the parameter `limit_outputs` to a plant whose outputs have ranges; the FMU itself reads it, no runtime."""
+    ranged = any(not p.boolean and p.name != "validity" and (p.minimum, p.maximum) != (None, None) for p in block.outputs)
+    if block.role != "plant" or not ranged or LIMIT_OUTPUTS in [port.name for port in block.parameters]:
+        return block
+    text = "true: outputs are clipped to their declared min and max; validity is 0 there in any case"
+    port = Port(name=LIMIT_OUTPUTS, description=text, boolean=True, minimum=0.0, maximum=1.0)
+    return replace(block, parameters=(*block.parameters, port))
 
 
 def generation_tool() -> str:
@@ -251,8 +262,8 @@ def _variable(table: Element, port: Port, causality: str, reference: int, fmi: i
     numbers = _range_attributes(port) | ({} if causality == "output" else {"start": _start_attribute(port)})
     if port.boolean:
         kind, own = "Boolean", {name: text for name, text in numbers.items() if name == "start"}
-    elif port.integer and fmi == 3:
-        kind, own = "Int64", {name: str(int(float(text))) for name, text in numbers.items()}
+    elif port.integer:
+        kind, own = "Int32" if fmi == 3 else "Integer", {name: str(int(float(text))) for name, text in numbers.items() if name != "nominal"}
     else:
         kind, own = "Float64" if fmi == 3 else "Real", _unit_attributes(port) | numbers
     if fmi == 3:

@@ -26,7 +26,14 @@ from softneck.design import own_module
 from softneck.runtime import PREFIX, Block, Port, load_runtime
 
 from ..describe._describe import HOST_NEEDS, Buildable, FmuInfo, block_and_info, documentation_page
-from ..describe._description import Identity, exported_block, generation_tool, model_description, terminals_file
+from ..describe._description import (
+    Identity,
+    exported_block,
+    generation_tool,
+    model_description,
+    terminals_file,
+    with_limit_outputs,
+)
 from ._module import slave_module
 from ._zip import read_zip, write_zip
 
@@ -69,7 +76,7 @@ def build_fmu(
     refuse_existing(target, force=force)
     block, said = block_and_info(thing, info)
     check_block(block)
-    members = _members(exported_block(block), said, name)
+    members = _members(with_limit_outputs(exported_block(block)), said, name)
     with atomic_write(target, force=force) as temporary:
         write_zip(temporary, members)
     return target

@@ -11,6 +11,7 @@ import contextvars
 import ctypes
 import json
 import math
+import operator
 import sys
 import traceback
 from collections.abc import Callable
@@ -118,12 +119,19 @@ class SoftneckSlave(Fmi2Slave):
         self.advance: Callable[..., None] | None = None
         self.compiled = False
         self.quietly = _fmu_quiet()
+        outputs = [port["name"] for port in self.facts["outputs"]]
+        self.validity = outputs.index("validity") if "validity" in outputs else None
+        # Finite, so that an infinite output is outside too.
+        self.lows = [max(port["low"], -sys.float_info.max) for port in self.facts["outputs"]]
+        self.highs = [min(port["high"], sys.float_info.max) for port in self.facts["outputs"]]
         self._view()
 
     def _view(self) -> None:
         self.inputs = self.variables[: self.n_in]
         self.outputs = self.variables[self.n_in : self.n_known]
-        self.parameters = self.variables[self.n_known :]
+        # The last parameter may be the slave's own.
+        self.limited = bool(self.facts["parameters"]) and self.facts["parameters"][-1]["name"] == "limit_outputs"
+        self.parameters = self.variables[self.n_known : len(self.variables) - self.limited]
 
     def _get_log_queue(self) -> list[_FmuMessage]:
         return self.queue
@@ -165,6 +173,7 @@ class SoftneckSlave(Fmi2Slave):
         if self.stale:
             self.memory[:] = 0.0
             self.quietly(initialise, self.arrays, self.parameters, self.memory, self.pending)
+            self._check_outputs()
             self.outputs[:] = self.pending
             if self.advance is None:
                 self._choose(always=False)
@@ -219,16 +228,33 @@ class SoftneckSlave(Fmi2Slave):
         else:
             self.quietly(step, self.arrays, self.parameters, self.memory, self.inputs, self.pending)
         self.count += 1
+        self._check_outputs()
         if not self.plant:
             self.outputs[:] = self.pending
-        if not math.isfinite(sum(self.pending.tolist())):
-            self._check_outputs()
 
     def _check_outputs(self) -> None:
-        for port, value in zip(self.facts["outputs"], self.pending.tolist(), strict=True):
+        values = self.pending.tolist()
+        if all(map(operator.le, self.lows, values)) and all(map(operator.le, values, self.highs)):
+            return
+        for i, (port, value) in enumerate(zip(self.facts["outputs"], values, strict=True)):
             if math.isinf(value) or (math.isnan(value) and not port["missing"]):
                 time = self.start + self.count * self.sample_time
                 raise ValueError(f"output {port['name']} became {value} at t = {time:.6g} s: the model has diverged.")
+            slack = 1e-9 * (1.0 + abs(value))  # rounding of a model that ends at its limit
+            if value < port["low"] - slack or value > port["high"] + slack:
+                self._leave_range(i, port, value)
+
+    def _leave_range(self, i: int, port: dict[str, Any], value: float) -> None:
+        """Report an output outside of its range once; the outputs of this sample are not valid."""
+        if port["name"] not in self.warned:
+            self.warned.add(port["name"])
+            span = f"{port['low']:g} to {port['high']:g} {port['unit']}"
+            text = f"output {port['name']} = {value:g} is outside {span}: the model is not valid there."
+            self.tell(_FMU_WARNING, f"{self.facts['name']}: {text}")
+        if self.limited and self.variables[-1]:
+            self.pending[i] = min(max(value, port["low"]), port["high"])
+        if self.validity is not None:
+            self.pending[self.validity] = 0.0
 
     # Variables
 
@@ -243,6 +269,17 @@ class SoftneckSlave(Fmi2Slave):
         """Set Boolean inputs and parameters; inside they are 0.0 and 1.0."""
         for reference, value in zip(references, values, strict=True):
             self._set(reference, 1.0 if value else 0.0)
+
+    @_fmu_guarded
+    def set_integer(self, references: list[int], values: list[int]) -> None:
+        """Set whole-number parameters."""
+        for reference, value in zip(references, values, strict=True):
+            self._set(reference, float(value))
+
+    @_fmu_guarded
+    def get_integer(self, references: list[int]) -> list[int]:
+        """Return values of whole-number parameters."""
+        return [int(self.variables[reference]) for reference in references]
 
     @_fmu_guarded
     def get_real(self, references: list[int]) -> list[float]:

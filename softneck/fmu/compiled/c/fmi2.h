@@ -161,15 +161,29 @@ SN_EXPORT fmi2Status fmi2SetBoolean(fmi2Component c, const fmi2ValueReference vr
     return fmi2OK;
 }
 
+SN_EXPORT fmi2Status fmi2GetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2Integer value[])
+{
+    for (size_t i = 0; i < n; i++)
+        if (c == NULL || !sn_get_integer((sn_instance *)c, vr[i], &value[i]))
+            return fmi2Error;
+    return fmi2OK;
+}
+
+SN_EXPORT fmi2Status fmi2SetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer value[])
+{
+    for (size_t i = 0; i < n; i++)
+        if (c == NULL || !sn_set_integer((sn_instance *)c, vr[i], value[i]))
+            return fmi2Error;
+    return fmi2OK;
+}
+
 #define SN_NONE2(name, type)                                                                                        \
     SN_EXPORT fmi2Status name(fmi2Component c, const fmi2ValueReference vr[], size_t n, type value[])               \
     {                                                                                                               \
         (void)vr, (void)value;                                                                                      \
         return n == 0 ? fmi2OK : sn_refused2(c, #name);                                                             \
     }
-SN_NONE2(fmi2GetInteger, fmi2Integer)
 SN_NONE2(fmi2GetString, fmi2String)
-SN_NONE2(fmi2SetInteger, const fmi2Integer)
 SN_NONE2(fmi2SetString, const fmi2String)
 
 SN_EXPORT fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real size, fmi2Boolean no_set_before)

@@ -1,4 +1,4 @@
-/* FMI 3.0: Co-Simulation and Model Exchange with scalars of Float64, Int64 and Boolean over `sn_instance`, and refusals of
+/* FMI 3.0: Co-Simulation and Model Exchange with scalars of Float64, Int32 and Boolean over `sn_instance`, and refusals of
  * all else. */
 #ifndef SN_FMI3_H
 #define SN_FMI3_H
@@ -198,35 +198,23 @@ SN_EXPORT fmi3Status fmi3SetBoolean(fmi3Instance c, const fmi3ValueReference vr[
     return fmi3OK;
 }
 
-/* Inside all numbers are doubles, which carry whole ones up to 2^53. */
-static int sn_whole3(sn_instance *s, fmi3ValueReference vr, double value)
+SN_EXPORT fmi3Status fmi3GetInt32(fmi3Instance c, const fmi3ValueReference vr[], size_t n, fmi3Int32 values[], size_t nv)
 {
-    int whole = (int64_t)vr < s->values.n && (s->model.ports[vr].flags & SN_INTEGER);
-    if (!whole || !(fabs(value) <= SN_WHOLE))
-        sn_say(s, SN_FAIL, whole ? "variable %u: the integer is too large." : "variable %u is no Int64.", (unsigned)vr);
-    return whole && fabs(value) <= SN_WHOLE;
-}
-
-SN_EXPORT fmi3Status fmi3GetInt64(fmi3Instance c, const fmi3ValueReference vr[], size_t n, fmi3Int64 values[], size_t nv)
-{
-    double x;
     if (!sn_counts3(c, n, nv))
         return fmi3Error;
-    for (size_t i = 0; i < n; i++) {
-        if (!sn_get((sn_instance *)c, vr[i], &x) || !sn_whole3((sn_instance *)c, vr[i], x))
+    for (size_t i = 0; i < n; i++)
+        if (!sn_get_integer((sn_instance *)c, vr[i], &values[i]))
             return fmi3Error;
-        values[i] = (fmi3Int64)x;
-    }
     return fmi3OK;
 }
 
-SN_EXPORT fmi3Status fmi3SetInt64(fmi3Instance c, const fmi3ValueReference vr[], size_t n, const fmi3Int64 values[],
+SN_EXPORT fmi3Status fmi3SetInt32(fmi3Instance c, const fmi3ValueReference vr[], size_t n, const fmi3Int32 values[],
                                   size_t nv)
 {
     if (!sn_counts3(c, n, nv))
         return fmi3Error;
     for (size_t i = 0; i < n; i++)
-        if (!sn_whole3((sn_instance *)c, vr[i], (double)values[i]) || !sn_set((sn_instance *)c, vr[i], (double)values[i]))
+        if (!sn_set_integer((sn_instance *)c, vr[i], values[i]))
             return fmi3Error;
     return fmi3OK;
 }
@@ -249,8 +237,8 @@ SN_NONE3(Int8, fmi3Int8)
 SN_NONE3(UInt8, fmi3UInt8)
 SN_NONE3(Int16, fmi3Int16)
 SN_NONE3(UInt16, fmi3UInt16)
-SN_NONE3(Int32, fmi3Int32)
 SN_NONE3(UInt32, fmi3UInt32)
+SN_NONE3(Int64, fmi3Int64)
 SN_NONE3(UInt64, fmi3UInt64)
 SN_NONE3(String, fmi3String)
 

@@ -19,8 +19,9 @@ enum { SN_WARN = 1, SN_FAIL = 3 };
 typedef struct {
     sn_model model;
     sn_work work;
-    sn_v1 values, inputs, outputs, parameters, pending, state;
-    unsigned char *warned;
+    sn_v1 values, inputs, outputs, parameters, pending, state; /* `parameters` without `limit_outputs` */
+    unsigned char *warned; /* of inputs and outputs */
+    int32_t validity; /* its place among the outputs, -1 for none */
     double start, time, stop;
     int64_t count, states;
     int running, stale, stepping;
@@ -118,6 +119,12 @@ static size_t sn_room_needed(const sn_node *node)
     return bytes;
 }
 
+/* Whether the last parameter is the instance's own: outputs end at their declared limits. */
+static int sn_has_limits(const sn_model *m)
+{
+    return m->n_par > 0 && strcmp(m->ports[m->n_in + m->n_out + m->n_par - 1u].name, "limit_outputs") == 0;
+}
+
 static int sn_make_room(sn_instance *s)
 {
     const sn_model *m = &s->model;
@@ -135,7 +142,7 @@ static int sn_make_room(sn_instance *s)
     looks = m->ahead > 0 ? 2u * ((size_t)s->states + own) + m->n_in : 0u;
     kept = s->exchange ? own + (size_t)s->states + m->n_in : 0u;
     p = (double *)calloc(ports + own + (size_t)s->states + kept + looks + 1u, sizeof(double));
-    s->warned = (unsigned char *)calloc(m->n_in + 1u, 1);
+    s->warned = (unsigned char *)calloc((size_t)m->n_in + m->n_out + 1u, 1);
     if (p == NULL || s->warned == NULL) {
         free(p);
         return 0;
@@ -143,7 +150,11 @@ static int sn_make_room(sn_instance *s)
     s->values = (sn_v1){p, (int32_t)ports, 1};
     s->inputs = (sn_v1){p, (int32_t)m->n_in, 1};
     s->outputs = (sn_v1){p + m->n_in, (int32_t)m->n_out, 1};
-    s->parameters = (sn_v1){p + m->n_in + m->n_out, (int32_t)m->n_par, 1};
+    s->parameters = (sn_v1){p + m->n_in + m->n_out, (int32_t)(m->n_par - (uint32_t)sn_has_limits(m)), 1};
+    s->validity = -1;
+    for (i = 0; i < own; i++)
+        if (strcmp(m->ports[m->n_in + i].name, "validity") == 0)
+            s->validity = (int32_t)i;
     s->pending = (sn_v1){p + ports, (int32_t)own, 1};
     s->state = (sn_v1){p + ports + own, (int32_t)s->states, 1};
     more = s->state.p + s->states;
@@ -170,7 +181,7 @@ static void sn_restart(sn_instance *s)
         s->values.p[i] = i < m->n_in && (m->ports[i].flags & SN_MISSING) ? sn_from_bits(0x7ff8000000000000u)
                                                                         : m->ports[i].start;
     memset(s->pending.p, 0, (size_t)(s->pending.n + s->state.n) * sizeof(double));
-    memset(s->warned, 0, m->n_in);
+    memset(s->warned, 0, (size_t)m->n_in + m->n_out);
     s->start = s->time = 0.0;
     s->stop = SN_NEVER;
     s->count = 0;
@@ -187,16 +198,54 @@ static int sn_worked(sn_instance *s, int what)
     return 0;
 }
 
+/* Whether an output leaves what was declared; a model that ends at its limit may miss it by rounding. */
+static int sn_beyond(const sn_port *port, double x)
+{
+    double slack = 1e-9 * (1.0 + fabs(x));
+    return x < port->low - slack || x > port->high + slack;
+}
+
+/* Whether output `i` is held at its limit instead of `x`. */
+static int sn_is_limited(const sn_instance *s, uint32_t i, double x)
+{
+    return sn_has_limits(&s->model) && s->values.p[s->values.n - 1] != 0.0 && sn_beyond(&s->model.ports[s->model.n_in + i], x);
+}
+
+static double sn_limited(const sn_instance *s, uint32_t i, double x)
+{
+    const sn_port *port = &s->model.ports[s->model.n_in + i];
+    return !sn_is_limited(s, i, x) ? x : x < port->low ? port->low : port->high;
+}
+
+/* An output outside of its range: said once, and the outputs of this sample are not valid. */
+SN_APART static void sn_leave_range(sn_instance *s, uint32_t i)
+{
+    const sn_port *port = &s->model.ports[s->model.n_in + i];
+    double x = s->pending.p[i];
+    if (!s->warned[s->model.n_in + i])
+        sn_say(s, SN_WARN, "output %.80s = %g is outside %g to %g %.20s: the model is not valid there.", port->name, x,
+               port->low, port->high, port->unit);
+    s->warned[s->model.n_in + i] = 1;
+    s->pending.p[i] = sn_limited(s, i, x);
+    if (s->validity >= 0)
+        s->pending.p[s->validity] = 0.0;
+}
+
 static int sn_check_outputs(sn_instance *s)
 {
-    int finite = 1;
-    for (int64_t i = 0; i < s->pending.n; i++)
-        finite &= sn_finite(s->pending.p[i]);
-    if (finite)
+    int calm = 1;
+    for (int64_t i = 0; i < s->pending.n; i++) {
+        double x = s->pending.p[i];
+        const sn_port *port = &s->model.ports[s->model.n_in + i];
+        calm &= sn_finite(x) && x >= port->low && x <= port->high;
+    }
+    if (calm)
         return 1;
     for (int64_t i = 0; i < s->pending.n; i++) {
         double x = s->pending.p[i];
         const sn_port *port = &s->model.ports[s->model.n_in + i];
+        if (sn_beyond(port, x) && sn_finite(x))
+            sn_leave_range(s, (uint32_t)i);
         if (sn_infinite(x) || (sn_nan(x) && !(port->flags & SN_MISSING))) {
             sn_say(s, SN_FAIL, "output %.80s became %f at t = %.6g s: the model has diverged.", port->name, x,
                    s->start + (double)s->count * s->model.sample_time);
@@ -402,9 +451,9 @@ static int sn_look_ahead(sn_instance *s)
     if (!(s->looked & SN_WORKED_OUT) && !sn_work_out(s, SN_LOOK))
         return 0;
     for (uint32_t i = 0; i < m->ahead; i++) {
-        shown[i] = s->next.p[i];
-        if (!sn_finite(shown[i])) {
-            sn_say(s, SN_FAIL, "%.80s becomes %f: the model diverges.", m->ports[m->n_in + s->next.n + i].name, shown[i]);
+        shown[i] = sn_limited(s, i, s->next.p[i]);
+        if (!sn_finite(s->next.p[i])) {
+            sn_say(s, SN_FAIL, "%.80s becomes %f: the model diverges.", m->ports[m->n_in + s->next.n + i].name, s->next.p[i]);
             return 0;
         }
     }
@@ -441,7 +490,10 @@ static int sn_derivative(sn_instance *s, const uint32_t *unknown, size_t n, cons
             sn_say(s, SN_FAIL, "variable %u: derivatives are of outputs.", (unsigned)unknown[i]);
             return 0;
         }
-        moved[i] = unknown[i] < first ? 0.0 : s->next_rows.p[unknown[i] - first];
+        if (unknown[i] < first || sn_is_limited(s, unknown[i] - first, s->next.p[unknown[i] - first]))
+            moved[i] = 0.0;
+        else
+            moved[i] = s->next_rows.p[unknown[i] - first];
     }
     return 1;
 }
@@ -541,6 +593,29 @@ static SN_MERGED int sn_get(sn_instance *s, uint32_t i, double *value)
         return 1;
     }
     return sn_get_rarely(s, i, value);
+}
+
+/* Inside all numbers are doubles, which carry whole ones up to 2^53. */
+static int sn_is_integer(sn_instance *s, uint32_t i)
+{
+    int whole = (int64_t)i < s->values.n && (s->model.ports[i].flags & SN_INTEGER);
+    if (!whole)
+        sn_say(s, SN_FAIL, "variable %u is no integer.", (unsigned)i);
+    return whole;
+}
+
+static int sn_get_integer(sn_instance *s, uint32_t i, int32_t *value)
+{
+    double x;
+    if (!sn_is_integer(s, i) || !sn_get(s, i, &x))
+        return 0;
+    *value = (int32_t)(x < -2147483648.0 ? -2147483648.0 : x > 2147483647.0 ? 2147483647.0 : x);
+    return 1;
+}
+
+static int sn_set_integer(sn_instance *s, uint32_t i, int32_t value)
+{
+    return sn_is_integer(s, i) && sn_set(s, i, (double)value);
 }
 
 /* The whole state, to the bit: values, pending outputs and state vector stand behind each other, and in Model Exchange
