@@ -115,7 +115,9 @@ def exported_block(block: Block) -> Block:
 
 def with_limit_outputs(block: Block) -> Block:
     """Add the parameter `limit_outputs` to a plant whose outputs have ranges; the FMU itself reads it, no runtime."""
-    ranged = any(not p.boolean and p.name != "validity" and (p.minimum, p.maximum) != (None, None) for p in block.outputs)
+    ranged = any(
+        not p.boolean and p.name != "validity" and (p.minimum, p.maximum) != (None, None) for p in block.outputs
+    )
     if block.role != "plant" or not ranged or LIMIT_OUTPUTS in [port.name for port in block.parameters]:
         return block
     text = "true: outputs are clipped to their declared min and max; validity is 0 there in any case"
@@ -263,7 +265,10 @@ def _variable(table: Element, port: Port, causality: str, reference: int, fmi: i
     if port.boolean:
         kind, own = "Boolean", {name: text for name, text in numbers.items() if name == "start"}
     elif port.integer:
-        kind, own = "Int32" if fmi == 3 else "Integer", {name: str(int(float(text))) for name, text in numbers.items() if name != "nominal"}
+        kind, own = (
+            "Int32" if fmi == 3 else "Integer",
+            {name: str(int(float(text))) for name, text in numbers.items() if name != "nominal"},
+        )
     else:
         kind, own = "Float64" if fmi == 3 else "Real", _unit_attributes(port) | numbers
     if fmi == 3:
