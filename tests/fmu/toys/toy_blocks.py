@@ -22,7 +22,7 @@ def lag(pole: float = 0.9, sample_time: float = SAMPLE_TIME) -> Block:
             Port(name="extra", unit="N", missing=True, start=float("nan")),
         ),
         outputs=(
-            Port(name="pitch", unit="rad", minimum=-1.5, maximum=1.5, nominal=0.5),
+            Port(name="pitch", unit="rad", minimum=-100.0, maximum=100.0, nominal=0.5),
             Port(name="measurement_valid", boolean=True),
         ),
         parameters=(
