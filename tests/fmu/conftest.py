@@ -69,8 +69,10 @@ def _running(path: Path) -> Iterator[Running]:
             instanceName="test",
         )
         references = {v.name: v.valueReference for v in model.modelVariables}
-        kinds = [{v.name for v in model.modelVariables if v.type == kind} for kind in ("Boolean", "Integer")]
-        running = Running(fmu, references, *kinds)
+        booleans, integers = (
+            {v.name for v in model.modelVariables if v.type == kind} for kind in ("Boolean", "Integer")
+        )
+        running = Running(fmu, references, booleans, integers)
         callbacks = fmi2CallbackFunctions()
         callbacks.logger = fmi2CallbackLoggerTYPE(
             lambda _e, _i, status, _c, text: running.log.append((status, text.decode()))
