@@ -107,7 +107,7 @@ def command(
 
         write_page(html, verification_page(found, controller.name, path.name), force=force)
     if as_json:
-        print_json(contents)
+        print_json({**contents, "decision": verification.verification_decision(contents, path.name)})
     else:
         _print(path, found, folder)
     if not found.holds:

@@ -11,7 +11,6 @@ from ._validation_page import validation_page as validation_page
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
 from ._decisions import auto_decision as auto_decision
-from ._decisions import certificate_values as certificate_values
 from ._decisions import model_values as model_values
 from ._decisions import project_decision as project_decision
 from ._decisions import validation_decision as validation_decision

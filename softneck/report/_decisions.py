@@ -10,9 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from softneck.core import SettingsError, percent, required_rows
-from softneck.plots import cell
-from softneck.verification import MARGIN_GROUPS, metric_title
+from softneck.core import percent
+from softneck.verification import certificate_decision
 
 # The least simulation fits [%] with their words: `design` refuses models below 30, `identify auto` warns below 70.
 _FIT_WORDS = ((90.0, "very good"), (80.0, "good"), (70.0, "fair"), (30.0, "poor"))
@@ -119,21 +118,6 @@ def model_values(file: str, model: Any) -> dict[str, Any]:
     return {"file": file, "kind": getattr(model, "kind", ""), "fit": dict(fit), "chosen": "chosen" in findings}
 
 
-def certificate_values(file: str, content: Values) -> dict[str, Any]:
-    """Return the JSON values of a certificate in a project: its controller, what fails, what does not decide."""
-    rows = required_rows(content)
-    controller = content.get("files", {}).get("controller", {}).get("path", "")
-    failed = [
-        {key: row.get(key) for key in ("metric", "bound", "value", "limit", "note")}
-        for row in rows
-        if row.get("holds") is False
-    ]
-    return {"file": file, "of": str(content.get("certificate")), "controller": str(controller),
-            "kind": str(content.get("controller_kind", "")), "holds": bool(content.get("holds")) and bool(rows),
-            "requirements": len(rows), "failed": failed,
-            "undecided": [str(row["metric"]) for row in rows if row.get("holds") is None]}  # fmt: skip
-
-
 def project_decision(models: Sequence[Values], certificates: Sequence[Values], *, tuner: str | None) -> str:
     """Return the decision on a project: which model, which controller and what it holds, and what to do next.
 
@@ -151,42 +135,4 @@ def project_decision(models: Sequence[Values], certificates: Sequence[Values], *
     )
     if not verified:
         return " ".join(said)
-    one, count = verified[0], verified[0]["requirements"]
-    name, trade = (
-        f"{one['controller']} ({one['kind']})",
-        "" if tuner is None else f"open {tuner} to trade speed for caution",
-    )
-    if one["holds"]:
-        undecided = one["undecided"]
-        holds = f"{count - len(undecided)} of {count}" if undecided else f"all {count}"
-        rest = f"; {len(undecided)} do not decide" if undecided else ""
-        said.append(f"{name} holds {holds} requirements of {one['file']}{rest}.")
-        # Slack is known of plants with tensions alone, and other robots have no tendons.
-        if any(metric.startswith("sim.") and metric != "sim.slack_s" for metric in undecided):
-            way = "verify it over a simulation model of this robot too, or over a family with draws"
-        else:
-            way = "run it on drives with that certificate"
-        said.append(f"Next: {way}{', or ' + trade if trade else ''}.")
-        return " ".join(said)
-    failing = "; ".join(_requirement(row) for row in one["failed"][:2])
-    more = f" and {len(one['failed']) - 2} more" if len(one["failed"]) > 2 else ""
-    said.append(f"Do not run {name} yet: {len(one['failed'])} of {count} requirements fail: {failing}{more}.")
-    # A safety margin is never loosened.
-    margins = any(str(row["metric"]).startswith(MARGIN_GROUPS) for row in one["failed"])
-    way = "allow a slower rise" if margins else "loosen these"
-    said.append(f"Next: {way}, or record another motion and start with both logs{'; ' + trade if trade else ''}.")
-    return " ".join(said)
-
-
-_SIGNS = {"min": "at least", "max": "at most", "below": "below"}
-
-
-def _requirement(row: Values) -> str:
-    try:
-        name = metric_title(str(row["metric"])).rpartition(" (")[0]
-    except SettingsError:  # of another version
-        name = str(row["metric"])
-    value = "not computed" if row["value"] is None else cell(row["value"], ".3g")
-    # A note says why a value within its limit does not count.
-    note = f" ({row['note']})" if row["note"] else ""
-    return f"{name} {value}, required {_SIGNS.get(row['bound'], 'at most')} {cell(row['limit'], '.3g')}{note}"
+    return " ".join([*said, certificate_decision(verified[0], tuner=tuner)])

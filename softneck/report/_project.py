@@ -43,8 +43,9 @@ from softneck.identification import INFINITE, Rules, bandwidth_of, judge, judged
 from softneck.plots import Section, Table, cell, loop_chart, page, recording_chart, validation_chart
 from softneck.robot import ROBOT_FILE
 from softneck.signals import Recording, assess_quality, doubts_in, import_log, read_layout, read_recording
+from softneck.verification import certificate_values, metric_words
 
-from ._decisions import certificate_values, model_values, project_decision
+from ._decisions import model_values, project_decision
 from ._study_page import study_sections
 from ._validation_page import drawable
 
@@ -430,7 +431,7 @@ def _requirement(name: str, row: Mapping[str, Any]) -> list[str]:
     held = row.get("holds", False)
     unknown = "not computed" if row.get("value") is None else "does not decide"
     verdict = "holds" if held else unknown if held is None else "fails"
-    return [name, str(row.get("metric", "")), cell(row.get("value")), cell(row.get("limit")), verdict]
+    return [name, metric_words(str(row.get("metric", ""))), cell(row.get("value")), cell(row.get("limit")), verdict]
 
 
 def _changed_files(folder: Path, name: str, content: Mapping[str, Any]) -> list[str]:
@@ -460,7 +461,7 @@ def _loops(project: Project) -> Section:
         metrics.append([name, *_metrics(result)])
         for row in result.limits:
             verdict = "holds" if row["holds"] else "fails"
-            limits.append([name, row["metric"], cell(row["value"]), cell(row["limit"]), verdict])
+            limits.append([name, metric_words(row["metric"]), cell(row["value"]), cell(row["limit"]), verdict])
         if len(charts) < _MAX_CHARTS:
             signals = result.signals
             charts.append(loop_chart(signals.time, signals.signals, name, limits=result.bounds, robot=result.robot))

@@ -18,7 +18,15 @@ from softneck.design import assumed_lines
 from softneck.loop import error_unit
 from softneck.plots import GREY, Chart, Curve, Panel, Section, Table, cell, curve_styles, page, write_page
 from softneck.tuning import curve_times
-from softneck.verification import metric_title, nominal_plants, sources_of, start_of, write_linear
+from softneck.verification import (
+    certificate_decision,
+    metric_title,
+    nominal_plants,
+    sources_of,
+    start_of,
+    verdict_values,
+    write_linear,
+)
 
 from ._tuner import tuner_page
 
@@ -27,6 +35,7 @@ if TYPE_CHECKING:
     from softneck.verification import Requirement
 
 BEST, OBSERVER, CERTIFICATE, LOOP = "best.npz", "observer.npz", "best.certificate.json", "loop.toml"
+TUNER = "tuner.html"
 _LOOP_AT, _LOOP_TAUT = 1.0, 3.0
 
 
@@ -58,7 +67,8 @@ def write_tuned(found: Tuned, folder: Path, plants: Mapping[str, Path]) -> dict[
     _write(folder / "pareto.json", json.dumps(values["pareto"], indent=1) + "\n")
     _write(folder / "pareto.csv", _csv(found))
     write_page(folder / "report.html", tune_page(found), force=True)
-    write_page(folder / "tuner.html", tuner_page(found, folder, plants, certified=_verdict(found)), force=True)
+    certified = tune_decision(found, tuner=None)
+    write_page(folder / TUNER, tuner_page(found, folder, plants, certified=certified), force=True)
     return values
 
 
@@ -74,10 +84,9 @@ def tuned_values(found: Tuned, path: Path) -> dict[str, Any]:
         "loosened": _loosened_values(found),
         "evaluations": found.evaluations,
         "dropped": dict(found.dropped),
-        "verdicts": [{"metric": item.metric, "bound": item.bound, "limit": item.limit, "holds": holds, "note": note,
-                      "value": value if value is not None and math.isfinite(value) else None}
-                     for item, value, holds, note in _verdicts(found)],
+        "verdicts": _verdict_rows(found),
         "judged_elsewhere": found.judged_elsewhere(),
+        "decision": tune_decision(found),
     }  # fmt: skip
 
 
@@ -165,14 +174,31 @@ def tune_page(found: Tuned) -> str:
     return page(
         f"Controller for {found.task.robot.label()}, tuned",
         [_result(found, _steps(found, items)), _front(found), given],
-        verdict=_verdict(found),
+        verdict=tune_decision(found),
         holds=found.holds,
         footer="Written by softneck tune.",
     )
 
 
-def _verdict(found: Tuned) -> str:
-    return tune_verdict(found) if found.holds else f"Not all requirements hold. {failing_requirement(found)}"
+def tune_decision(found: Tuned, *, tuner: str | None = TUNER) -> str:
+    """Return the decision of `tune`, from the verdicts of its JSON; `tuner`: the page that it names, if any."""
+    one = {"file": CERTIFICATE, "controller": BEST, "kind": found.best.kind, "holds": found.holds,
+           **verdict_values(_verdict_rows(found))}  # fmt: skip
+    said = certificate_decision(one, tuner=tuner)
+    return f"{said} {_loosened_words(found)}" if found.holds and found.loosened else said
+
+
+def _loosened_words(found: Tuned) -> str:
+    return f"Loosened: {'; '.join(one.in_words(metric) for metric, one in found.loosened.items())}."
+
+
+def _verdict_rows(found: Tuned) -> list[dict[str, Any]]:
+    """Return the JSON values of each requirement."""
+    return [
+        {"metric": item.metric, "bound": item.bound, "limit": item.limit, "holds": holds, "note": note,
+         "value": value if value is not None and math.isfinite(value) else None}
+        for item, value, holds, note in _verdicts(found)
+    ]  # fmt: skip
 
 
 def tune_verdict(found: Tuned) -> str:

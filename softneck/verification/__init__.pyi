@@ -10,6 +10,10 @@ from ._worst import linear_plant as linear_plant
 
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
+from ._decision import certificate_decision as certificate_decision
+from ._decision import certificate_values as certificate_values
+from ._decision import metric_words as metric_words
+from ._decision import verdict_values as verdict_values
 from ._experiments import crossing_values as crossing_values
 from ._experiments import crossings as crossings
 from ._linear import LARGE as LARGE
@@ -38,6 +42,7 @@ from ._neck_loops import step_loop as step_loop
 from ._neck_loops import step_time as step_time
 from ._neck_loops import without_lead as without_lead
 from ._page import verdict_table as verdict_table
+from ._page import verification_decision as verification_decision
 from ._plants import Plants as Plants
 from ._plants import all_plants as all_plants
 from ._plants import nominal_plants as nominal_plants

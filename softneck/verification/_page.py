@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +13,7 @@ from softneck.core import Vector, to_si
 from softneck.loop import error_unit
 from softneck.plots import BLUE, GREEN, GREY, ORANGE, Chart, Curve, Level, Panel, Section, Table, cell, page
 
+from ._decision import certificate_decision, certificate_values
 from ._evidence import Evidence, LinearEvidence
 from ._linear import inverse, loops
 from ._metrics import Scale, metric_title
@@ -224,30 +227,16 @@ def verification_page(found: Verification, controller: str, certificate: str = "
     sections.append(_plants_section(found))
     words = "holds" if found.holds else "does not hold"
     return page(
-        f"{controller} {words}", sections, verdict=_verdict_sentence(found), holds=found.holds,
-        footer="Written by softneck verify.",
+        f"{controller} {words}", sections, verdict=verification_decision(found.contents(), certificate),
+        holds=found.holds, footer="Written by softneck verify.",
     )  # fmt: skip
 
 
-def _verdict_sentence(found: Verification) -> str:
-    """Return the verdict with the failed requirements."""
-    axes = found.controller.robot.outputs.names
-    failed = [
-        f"{metric_title(v.requirement.metric)} is {cell(v.value)}, required {_limit(v)} ({_worst_plant(v, axes)})"
-        for v in found.failed
-    ]
-    count, plants = len(found.verdicts), f"{len(found.evidence.plants)} plants"
-    if not failed:
-        held = sum(verdict.holds is True for verdict in found.verdicts)
-        absent = sum(verdict.value is None for verdict in found.verdicts)
-        open_ = [(count - held - absent, "do not decide"), (absent, "are not computed")]
-        rest = "".join(f", {number} {words}" for number, words in open_ if number)
-        return (
-            f"{held} of {count} requirements hold{rest} and none fails, against {plants} and "
-            f"{len(found.evidence.necks)} simulated loops."
-        )
-    more = f"; {len(failed) - 3} more below" if len(failed) > 3 else ""
-    return f"{len(failed)} of {count} requirements fail: {'; '.join(failed[:3])}{more}."
+def verification_decision(contents: Mapping[str, Any], certificate: str) -> str:
+    """Return the decision of `verify` from its JSON; `certificate` is the name of the file."""
+    said = certificate_decision(certificate_values(certificate or "its certificate", contents))
+    plants, loops = contents["plants"]["count"], contents["virtual_neck_loops"]
+    return f"{said} Judged against {plants} plants and in {loops} simulated loops."
 
 
 def _requirements_section(found: Verification, certificate: str, stepped: Chart) -> Section:

@@ -7,12 +7,15 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import control
 import numpy as np
 import pytest
+import scipy.linalg
 
 from softneck.core import SettingsError
 from softneck.design import PidSettings
 from softneck.design.linear import _pid, _settings
+from softneck.design.linear._axis_loop import conditioning_candidates, error_feedback
 from softneck.design.linear._pid import PidGains, _cost, _WorstCase
 
 DT = 0.02
@@ -193,3 +196,19 @@ def test_every_sample_must_be_stable_and_keep_its_sensitivity(monkeypatch: pytes
             continue
         with pytest.raises(SettingsError, match=rf"around {len(lost)} of 3 samples \(the first is sample {lost[0]}\)"):
             SETTINGS._require_stable(None, axis)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_riccati_equation_without_a_solution_gives_no_conditioning(monkeypatch: pytest.MonkeyPatch) -> None:
+    controller = error_feedback(control.ss(control.TransferFunction([3.0, -2.9], [1.0, -1.0], 0.02)))
+    assert conditioning_candidates(controller)
+    solve, calls = scipy.linalg.solve_discrete_are, list[int]()
+
+    def second_fails(*args: np.ndarray) -> np.ndarray:
+        calls.append(1)
+        if len(calls) > 1:
+            raise np.linalg.LinAlgError
+        return solve(*args)
+
+    monkeypatch.setattr(scipy.linalg, "solve_discrete_are", second_fails)
+    assert len(conditioning_candidates(controller)) == 1
+    assert len(calls) > 2

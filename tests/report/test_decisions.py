@@ -17,12 +17,12 @@ from softneck.report import decision_values, project_page, read_project, validat
 from softneck.report._decisions import (
     auto_decision,
     beats,
-    certificate_values,
     fit_word,
     list_fits,
     project_decision,
     validation_decision,
 )
+from softneck.verification import certificate_values
 
 from ..data import ROOT, neck_recording
 
@@ -168,7 +168,7 @@ def test_a_project_decides_on_model_controller_and_next_step() -> None:
         said = project_decision(
             [], [certificate_values("c.json", {**certificate(0), "requirements": rows})], tuner=None
         )
-        assert "holds 1 of 2 requirements of c.json; 1 do not decide." in said
+        assert "holds 1 of 2 requirements of c.json; 1 does not decide." in said
         assert way in said
     # The certificate that fails decides, wherever it is in the list.
     failed = certificate_values("z.json", certificate(3))

@@ -22,6 +22,7 @@ from softneck.tuning import Tuned, tune
 
 from ..browser import Shown, own_text, shown
 from ..data import ROOT
+from .test_decisions import figures, is_value, opening, values_of
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -59,6 +60,26 @@ def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     found = tune(named, asked, kinds=("pi",), budget=budget, workers=0, folder=folder)
     values = write_tuned(found, folder, plants)
     return Made(found, folder, values, packed_data((folder / "tuner.html").read_text()))
+
+
+def test_the_report_opens_with_the_decision_whose_figures_are_in_the_json(made: Made) -> None:
+    """What fails is named in words with its value and limit; a search that holds says what to do next."""
+    said = opening((made.folder / "report.html").read_text())
+    assert said == made.values["decision"]
+    assert figures(said)
+    rows = made.values["verdicts"]
+    counts = [float(len(rows)), *(float(sum(row["holds"] is held for row in rows)) for held in (True, False, None))]
+    # The note of a requirement is text of its own.
+    notes = [row["note"] for row in rows if row["note"]]
+    for note in notes:
+        said = said.replace(note, "")
+    known = [*counts, *(count - 2.0 for count in counts), *values_of(made.values)]
+    assert [figure for figure in figures(said) if not is_value(figure, known)] == []
+    if made.found.holds:
+        assert said.startswith("best.npz (pi) holds ")
+    else:
+        assert said.startswith(f"Do not run best.npz (pi) yet: {int(counts[2])} of {len(rows)} requirements fail: ")
+    assert made.data["certified"] in made.values["decision"].replace("; open tuner.html to trade speed for caution", "")
 
 
 @pytest.fixture

@@ -23,6 +23,7 @@ from softneck.verification import (
     linear_plant,
     make_requirements,
     read_requirements,
+    verification_decision,
     verification_page,
     verify,
 )
@@ -107,7 +108,7 @@ def test_the_verdict_counts_what_was_not_computed_or_does_not_decide_as_neither(
     open_ = [replace(first, holds=None), replace(second, holds=None, value=None), *rest]
     page = verification_page(replace(held, verdicts=open_), "pi")
     count = len(held.verdicts)
-    assert f"{count - 2} of {count} requirements hold, 1 do not decide, 1 are not computed and none fails" in page
+    assert f"holds {count - 2} of {count} requirements of its certificate; 2 do not decide." in page
 
 
 @pytest.mark.slow
@@ -335,6 +336,7 @@ def test_the_page_is_drawn_in_full(browser: Any, held: Verification, tmp_path: P
         assert view.page.locator("td.holds").count() == len(held.verdicts)
         count = sum(verdict.holds is True for verdict in held.verdicts)
         said = view.page.locator(".verdict").inner_text()
-        assert said.startswith(f"{count} of {len(held.verdicts)} requirements hold and none fails")
+        assert said == verification_decision(held.contents(), "pi.certificate.json")
+        assert said.startswith(f"The controller (pi) holds all {count} requirements of pi.certificate.json. Next: ")
         assert view.pixels(0, 0, "#000000") > 50, "the nominal loop of the first Bode panel"
         assert not math.isnan(view.x_range(0)[0])

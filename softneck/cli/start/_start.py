@@ -257,7 +257,8 @@ def _facts(run: ProjectRun, folder: Path) -> dict[str, Any]:
 
 def _decision(models: Sequence[dict[str, Any]]) -> str:
     """Return the decision with which the project's page opens."""
-    from softneck.report import certificate_values, project_decision
+    from softneck.report import project_decision
+    from softneck.verification import certificate_values
 
     found = [path for path in (Path(_CERTIFICATE_FILE), Path(CERTIFICATE)) if path.is_file()]
     read = [certificate_values(path.as_posix(), json.loads(settings_text(path, MOST_JSON))) for path in found]
