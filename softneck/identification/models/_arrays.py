@@ -44,7 +44,7 @@ def runtime_arrays(kind: str, arrays: Mapping[str, Matrix]) -> dict[str, Matrix]
     motors = len(own["drive"]) if "drive" in own else int(history[2]) if len(history) > 2 else 3
     empty = {
         "ground": np.zeros((0, 1 + 2 * motors)), "doubt": np.zeros((outputs, 3)), "offset": np.zeros(outputs),
-        "body": np.array([1.0, 0.0, 0.0, 0.0, 1.0]),
+        "body": np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]),
     }  # fmt: skip
     names = _names(_module_of(kind, arrays))
     found = {name: own[name] if name in own else empty[name] for name in names}

@@ -29,7 +29,7 @@ from ..models._fitting import ScaledData, training_recording
 from ..models._linear_systems import history_array
 from ..models._model import Model
 from ._output_error import SETTLING_S, FitProblem, Found, SearchProgress, intervals
-from ._parameters import CREEP_PARAMETERS, PARAMETERS, PAYLOAD_CURVE, PAYLOAD_PARAMETERS, SOFTENING_PARAMETERS
+from ._parameters import BODY_PARAMETERS, PARAMETERS, PAYLOAD_CURVE, PAYLOAD_PARAMETERS, RIGID
 from ._parts import describe_parts, extend, parts_of
 
 # A held input is forgotten after so long [s of a neck's time].
@@ -48,11 +48,11 @@ class GreyBox:
     the recordings' channel `payload` has several values, two more say what it changes.
 
     Attributes:
-        evaluations: at most so many steps of Gauss-Newton for each dead time.
+        evaluations: at most so many steps of Levenberg-Marquardt for each dead time.
         sensor_delay: dead time of the inclinometer in samples; None tries 1 to 4, of a slower robot as
             many more.
-        body: what it has beside these numbers: nothing ("rigid"), some of softening, creep and tendons (their angles
-            and arms) joined by "+", or "all".
+        body: what it has beside these numbers: nothing ("rigid"), some of anisotropy, stop (of compression),
+            softening, creep and tendons (their angles and arms) joined by "+", or "all".
     """
 
     evaluations: int = 40
@@ -115,7 +115,7 @@ def _model(settings: GreyBox, problem: FitProblem, scaled: ScaledData, delay: in
         "history": history_array(int(max(_NOISE_ORDER, drive[:, 1].max())), outputs),
         "drive": drive,
         "neck": numbers,
-        **({"body": problem.body(x)} if any(problem.body(x)[1:4]) else {}),
+        **({"body": problem.body(x)} if (problem.body(x)[1:] != RIGID[1:]).any() else {}),
         "sensor": np.array([float(delay), problem.sample_time]),
         "echo": echo,
         "memory": memory_array(_MEMORY_S, problem.sample_time),
@@ -152,11 +152,11 @@ def check_greybox(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> Non
 
 
 def _check_body(body: Matrix) -> None:
-    low = [1e-6, *(number.low for number in (*SOFTENING_PARAMETERS, *CREEP_PARAMETERS))]
-    high = [np.pi, *(number.high for number in (*SOFTENING_PARAMETERS, *CREEP_PARAMETERS))]
+    low = [1e-6, *(number.low for number in BODY_PARAMETERS)]
+    high = [np.pi, *(number.high for number in BODY_PARAMETERS)]
     # A thousandth for the rounding of logarithms.
-    if (body < 0.999 * np.array(low)).any() or (body > 1.001 * np.array(high)).any():
-        raise FileFormatError("its array `body` holds a reach, softening or creep that is out of range.")
+    if (body < np.array(low) - 1e-3 * np.abs(low)).any() or (body > 1.001 * np.array(high)).any():
+        raise FileFormatError("its array `body` holds a reach or a number of an optional part that is out of range.")
 
 
 def _check_payload(load: Matrix) -> None:

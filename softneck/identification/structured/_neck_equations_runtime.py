@@ -5,11 +5,13 @@ Lengths of tendon are in radians of motor, tensions in radians of stretch, so th
 - drive: m_j lags its delayed set-point, and stops where its tension reaches `pull_limit`;
 - stretch: x_j = pretension + m_j - lever (e_j . b) - s, tension T_j = max(0, x_j): a tendon only pulls;
 - bend: b' = gain sum T_j e_j - stiffness F (1 +- asymmetry) (b - rest) - stiffening |b|^2 b - friction z
-  - stiffness creep (b - r);
+  - stiffness creep (b - r) - F stiffness a(b);
 - softening: F = (1 - lasting (1 - exp(-2 B / reach))) (1 + a / 2) / (1 + a |b| / reach), B the largest bend of late,
   forgotten over 300 time constants (Mullins 1969, Rubber Chem. Technol. 42:339), a the softening;
+- anisotropy: a = coupling (b_2 - rest_2, b_1 - rest_1) + (l_1 q - l_2 p, -l_1 p - l_2 q), where
+  q = 2 (b_1^2 - b_2^2) / (reach + |b|) and p = 4 b_1 b_2 / (reach + |b|): three lobes, of bounded slope;
 - creep (a Maxwell branch): r' = creep_rate (b - r);
-- compression: s' = axial_rate (compliance (sum (T_j - pretension)) - s);
+- compression: s' = axial_rate (compliance (sum (T_j - pretension)) - s - 9 max(0, s - 1 / stop));
 - hysteresis (Dahl): z' = b' - |b'| z / friction_angle, so |z| <= friction_angle;
 - tilt: pitch = atan2(sin|b| b_1/|b|, cos|b|), roll likewise, through a dead time and a first-order lag.
 
@@ -62,7 +64,10 @@ BODY_SOFTENING = 1
 BODY_LASTING = 2
 BODY_CREEP = 3
 BODY_CREEP_RATE = 4
-BODY_SIZE = 5
+BODY_COUPLING = 5
+BODY_LOBES = 6  # two
+BODY_STOP = 8
+BODY_SIZE = 9
 # The largest bend of late is forgotten over 60 s of a neck's time, 300 time constants.
 _FORGET_RATE = 1.0 / 60.0
 # A stalled drive gives way as the bend does: 4 ms at 20 ms follow that closely enough.
@@ -117,6 +122,11 @@ def neck_advance(
     whole *= 1.0 - body[BODY_LASTING] * (1.0 - math.exp(-2.0 * x.largest / body[BODY_REACH]))
     creep = neck[NECK_STIFFNESS] * body[BODY_CREEP]
     softening = body[BODY_SOFTENING] / body[BODY_REACH]
+    coupling = body[BODY_COUPLING]
+    lobe0 = body[BODY_LOBES]
+    lobe1 = body[BODY_LOBES + 1]
+    # The largest slope that these add, as a part of the stiffness.
+    skew = abs(coupling) + 4.0 * (abs(lobe0) + abs(lobe1))
     size = math.sqrt(x.b[0] * x.b[0] + x.b[1] * x.b[1])
     for _ in range(_SUBSTEPS):
         pull0 = 0.0
@@ -145,9 +155,15 @@ def neck_advance(
         )
         f0 -= creep * (x.b[0] - x.r[0])
         f1 -= creep * (x.b[1] - x.r[1])
+        # Three lobes make it stiffer each 120 deg; divided, so that their slope stays bounded at large bends.
+        q = 2.0 * (x.b[0] * x.b[0] - x.b[1] * x.b[1]) / (body[BODY_REACH] + size)
+        p = 4.0 * x.b[0] * x.b[1] / (body[BODY_REACH] + size)
+        f0 -= stiffness * (coupling * (x.b[1] - neck[NECK_REST + 1]) + lobe0 * q - lobe1 * p)
+        f1 -= stiffness * (coupling * (x.b[0] - neck[NECK_REST]) - lobe0 * p - lobe1 * q)
         # Minus the slope of f over b, one number for both directions: the cube's at its steepest, and half of each taut
         # tendon, as e e' of all three add up to 3/2.
         rate = stiffness + 3.0 * loss + share * taut * neck[NECK_GAIN] * neck[NECK_LEVER] + neck[NECK_FRICTION] + creep
+        rate += skew * stiffness
         d0 = dt * f0 / (1.0 + dt * rate)  # one stage: (1 + dt rate) d = dt f
         d1 = dt * f1 / (1.0 + dt * rate)
         x.b[0] += d0
@@ -164,8 +180,12 @@ def neck_advance(
         x.z[1] = (x.z[1] + d1) / forget
         axial = neck[NECK_AXIAL_RATE]
         rise = axial * (neck[NECK_COMPLIANCE] * (total - m.shape[0] * neck[NECK_PRETENSION]) - x.s)
+        touch = 0.0
+        if body[BODY_STOP] * x.s > 1.0:  # coils touch: ten times as stiff
+            touch = 9.0
+            rise -= axial * touch * (x.s - 1.0 / body[BODY_STOP])
         # Its slope again: s itself, and each taut tendon, which gets looser as the link gives way.
-        x.s += dt * rise / (1.0 + dt * axial * (1.0 + neck[NECK_COMPLIANCE] * taut))
+        x.s += dt * rise / (1.0 + dt * axial * (1.0 + touch + neck[NECK_COMPLIANCE] * taut))
     part = 1.0 - math.exp(-body[BODY_CREEP_RATE] * sample_time)
     x.r[0] += part * (x.b[0] - x.r[0])
     x.r[1] += part * (x.b[1] - x.r[1])
@@ -245,7 +265,7 @@ class GreyBoxArrays(NarxArrays):
     """The parameters of the equations and the arrays around them."""
 
     neck = array("numbers", "of the equations, in the order of NECK_*; of another robot its tendons behind them")
-    body = array("5", "reach [rad], softening, lasting softening, creep [1], rate of creep [1/s]; see BODY_*")
+    body = array("9", "reach [rad], softening, creep, anisotropy, stop; see BODY_*")
     sensor = array("2", "dead time [samples], and sample time in the time of a neck [s]")
     echo = array("outputs, p", "of what was measured above the equations, newest first")
     memory = array("1", "samples after which a held start has settled")

@@ -1,4 +1,4 @@
-"""The error of the grey box's simulation over recordings, and its search by Gauss-Newton."""
+"""The error of the grey box's simulation over recordings, and its search by Levenberg-Marquardt."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from softneck.runtime import load_functions
 
 from ..models._drive import drive_start
 from ..models._fitting import ScaledData, payload_of
+from ._levenberg_marquardt import Bounds, minimise
 from ._loaded_greybox_runtime import loaded_neck
 from ._parameters import (
+    BODY_PARAMETERS,
     OUT_OF_PLANE_PARAMETERS,
     PARAMETERS,
     PARTS,
@@ -28,7 +30,8 @@ from ._parameters import (
 _SIMULATION_RUNTIME = "softneck.identification.structured._neck_equations_runtime"
 # An error of a motor counts as much as one of the tilt twenty times smaller: about the ratio of their ranges.
 _MOTOR_WEIGHT = 0.05
-# How much a number a spread away from its guess counts, as an error [rad] of one row: next to nothing.
+# How much a number a spread away from its guess counts, as an error [rad] of one row: next to nothing. Optional parts
+# are searched with a prior as strong as the error of the equations makes it, see `FitProblem.as_sure_as`.
 _PRIOR_WEIGHT_RAD = 0.005
 # The start is unknown for so long [s of a neck's time].
 SETTLING_S = 0.5
@@ -39,6 +42,8 @@ _TYPICAL_DRIVE_DELAY = 0.08
 DECIMATION = 2
 # Steps of a search that starts at what a like one found.
 _SHORT = 8
+# How much the sensor's dead time usually changes [samples].
+_DELAY_SPREAD = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +52,8 @@ class FitProblem:
 
     runs: set-points, start, motor positions and outputs of each; rows: those of each run that count; payloads: [kg];
     drive: (motors, 2) pole and delay; logged: whether motor positions were; numbers: searched; tendons: nothing of
-    three tendons 120 deg apart; reach: largest tilt [rad].
+    three tendons 120 deg apart; reach: largest tilt [rad]; prior: what a number a spread away from its guess counts, as
+    an error [rad] of one row.
     """
 
     sample_time: float
@@ -60,6 +66,7 @@ class FitProblem:
     numbers: tuple[Parameter, ...]
     tendons: Vector
     reach: float
+    prior: float = _PRIOR_WEIGHT_RAD
 
     @classmethod
     def of(cls, scaled: ScaledData) -> FitProblem:
@@ -95,9 +102,20 @@ class FitProblem:
         """Whether it has three tendons 120 deg apart, whose angles can be searched."""
         return not self.tendons.size
 
+    @property
+    def has_two_outputs(self) -> bool:
+        """Whether it bends in two directions."""
+        return self.runs[0][3].shape[1] == 2
+
     def with_parts(self, *parts: str) -> FitProblem:
         """Return the problem with the numbers of optional parts."""
         return replace(self, numbers=(*self.numbers, *(number for part in parts for number in PARTS[part])))
+
+    def as_sure_as(self, x: Vector, delay: float) -> FitProblem:
+        """Return the problem with the prior that the error at `x` gives: of one independent row (Bayes)."""
+        misses = self.misses(x, delay)
+        error = np.sqrt(np.nanmean(np.concatenate(misses) ** 2) * correlation_time(misses))
+        return replace(self, prior=max(float(error), _PRIOR_WEIGHT_RAD))
 
     def delays(self) -> tuple[int, ...]:
         """Return the sensor's dead times to try [samples], the likeliest first."""
@@ -111,9 +129,9 @@ class FitProblem:
         return np.array([*(found.get(number.name, number.guess) for number in PARAMETERS), *tendons])
 
     def body(self, x: Vector) -> Vector:
-        """Return the numbers of the body's softening and creep."""
+        """Return the numbers of the optional parts but the tendons."""
         found = self._found(x)
-        names = ("softening", "lasting_softening", "creep", "creep_rate")
+        names = [number.name for number in BODY_PARAMETERS]
         return np.array(
             [self.reach, *(found.get(name, default) for name, default in zip(names, RIGID[1:], strict=True))]
         )
@@ -159,7 +177,7 @@ class FitProblem:
         """Return the errors that are minimised: of tilts, of motors, and of the numbers against their guesses."""
         guess = np.array([number.encode(number.guess) for number in self.numbers])
         spread = np.array([number.spread for number in self.numbers])
-        parts = [_PRIOR_WEIGHT_RAD * (x - guess) / spread]
+        parts = [self.prior * (x - guess) / spread]
         for (M, Y), (_, _, m, y), rows in zip(self.simulate(x, delay), self.runs, self.rows, strict=True):
             parts.append((Y - y)[rows].ravel())
             if self.logged:
@@ -182,7 +200,7 @@ class FitProblem:
                 yield best
 
     def search(self, start: Vector, delay: int, evaluations: int, tell: SearchProgress) -> Found:
-        """Return the numbers with the smallest error, by a trust-region Gauss-Newton from `start`."""
+        """Return the numbers with the smallest error, by Levenberg-Marquardt from `start`."""
         x, _ = self._search(start, delay, evaluations, tell, None)
         e = self.errors(x, delay)
         return Found(self, x, delay, 0.5 * float(e @ e))
@@ -190,22 +208,20 @@ class FitProblem:
     def _search(
         self, start: Vector, delay: float, evaluations: int, tell: SearchProgress, delays: tuple[int, int] | None
     ) -> tuple[Vector, float]:
-        from scipy.optimize import least_squares
-
         n = len(self.numbers)
         low = np.array([number.encode(number.low) for number in self.numbers])
         high = np.array([number.encode(number.high) for number in self.numbers])
-        inside = np.clip(start, low + 1e-6 * (high - low), high - 1e-6 * (high - low))
+        scale = np.array([number.spread for number in self.numbers])
         if delays is not None:
-            low, high = np.append(low, delays[0]), np.append(high, delays[1])
-            inside = np.append(inside, np.clip(delay, delays[0] + 0.1, delays[1] - 0.1))
+            start, low, high = np.append(start, delay), np.append(low, delays[0]), np.append(high, delays[1])
+            scale = np.append(scale, _DELAY_SPREAD)
 
         def errors(x: Vector) -> Vector:
             e = self.errors(x[:n], delay if delays is None else float(x[n]))
             tell.see(0.5 * float(e @ e), x)
             return e
 
-        x = least_squares(errors, inside, bounds=(low, high), x_scale="jac", max_nfev=evaluations, xtol=1e-5).x
+        x = minimise(errors, start, Bounds(low, high, scale), evaluations)
         return x[:n], delay if delays is None else float(x[n])
 
 

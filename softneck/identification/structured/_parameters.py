@@ -93,9 +93,27 @@ TENDON_PARAMETERS = (
     Parameter("arm_2", "1", 1.0, 0.5, 2.0, 0.1, True, "arm of tendon 2 over that of tendon 1"),
     Parameter("arm_3", "1", 1.0, 0.5, 2.0, 0.1, True, "arm of tendon 3 over that of tendon 1"),
 )
-PARTS = {"softening": SOFTENING_PARAMETERS, "creep": CREEP_PARAMETERS, "tendons": TENDON_PARAMETERS}
+# Where it is stiffer: between the axes, as a spring's main directions may lie, and towards three lobes.
+ANISOTROPY_PARAMETERS = (
+    Parameter("coupling", "1", 0.0, -0.5, 0.5, 0.1, False, "stiffness between pitch and roll over their mean"),
+    Parameter("lobe_pitch", "1", 0.0, -0.5, 0.5, 0.1, False, "stiffness at the reach of three lobes, one in pitch"),
+    Parameter("lobe_roll", "1", 0.0, -0.5, 0.5, 0.1, False, "stiffness at the reach of three lobes, one in roll"),
+)
+# Coils that touch, or foam that is dense.
+STOP_PARAMETERS = (
+    Parameter("stop", "1/rad", 1.4, 0.0, 20.0, 5.0, False, "one over the compression at which the link gets stiff"),
+)
+PARTS = {
+    "anisotropy": ANISOTROPY_PARAMETERS,
+    "stop": STOP_PARAMETERS,
+    "softening": SOFTENING_PARAMETERS,
+    "creep": CREEP_PARAMETERS,
+    "tendons": TENDON_PARAMETERS,
+}
+# In the order of BODY_*, behind the reach.
+BODY_PARAMETERS = (*SOFTENING_PARAMETERS, *CREEP_PARAMETERS, *ANISOTROPY_PARAMETERS, *STOP_PARAMETERS)
 # A body of constant stiffness without creep.
-RIGID = np.array([1.0, 0.0, 0.0, 0.0, 1.0])
+RIGID = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
 
 # Those that have no meaning where the link bends in one plane.
 OUT_OF_PLANE_PARAMETERS = ("asymmetry", "rest_roll", "twist")

@@ -1,4 +1,4 @@
-"""The optional parts of the grey box: softening, creep, displaced tendons."""
+"""The optional parts of the grey box: anisotropy, stop, softening, creep, displaced tendons."""
 
 from __future__ import annotations
 
@@ -23,9 +23,13 @@ def parts_of(body: str) -> tuple[str, ...]:
 
 
 def extend(found: Found, parts: Sequence[str], evaluations: int, tell: SearchProgress) -> Found:
-    """Return the fit with the numbers of `parts`, searched from what was found without."""
-    able = [part for part in parts if part != "tendons" or found.problem.has_neck_tendons]
-    larger = found.problem.with_parts(*able)
+    """Return the fit with the numbers of `parts`, searched from what was found without.
+
+    Those that a robot cannot have are left out: tendons of other robots, anisotropy in a plane.
+    """
+    can = {"tendons": found.problem.has_neck_tendons, "anisotropy": found.problem.has_two_outputs}
+    able = [part for part in parts if can.get(part, True)]
+    larger = found.problem.as_sure_as(found.x, found.delay).with_parts(*able)
     new = larger.numbers[len(found.x) :]
     tell.what = "parts"
     x = np.concatenate([found.x, [number.encode(number.guess) for number in new]])
@@ -36,8 +40,19 @@ def describe_parts(problem: FitProblem, x: Vector, second: float) -> str:
     """Return in words what the optional numbers say; `second`: of the equations' time in SI [s]."""
     found = {number.name: number.decode(value) for number, value in zip(problem.numbers, x, strict=True)}
     parts = []
+    reach = np.degrees(problem.reach)
+    if "coupling" in found:
+        stiffer = np.hypot(found["asymmetry"], found["coupling"])
+        along = 0.5 * np.degrees(np.arctan2(found["coupling"], found["asymmetry"])) % 180.0
+        lobes = np.hypot(found["lobe_pitch"], found["lobe_roll"])
+        toward = np.degrees(np.arctan2(-found["lobe_roll"], found["lobe_pitch"])) / 3.0 % 120.0
+        parts.append(
+            f"stiffness is {100.0 * stiffer:.0f} % larger than its mean along {along:.0f} deg, and at {reach:.0f} deg "
+            f"{100.0 * lobes:.0f} % larger towards {toward:.0f} deg and each 120 deg from there"
+        )
+    if "stop" in found and found["stop"] > 0.0:
+        parts.append(f"beyond a compression of {1.0 / found['stop']:.2g} rad of motor the link is ten times stiffer")
     if "softening" in found:
-        reach = np.degrees(problem.reach)
         fall = 1.0 - 1.0 / (1.0 + found["softening"])
         parts.append(
             f"stiffness falls by {100.0 * fall:.0f} % from rest to {reach:.0f} deg, "

@@ -11,7 +11,7 @@ import pytest
 from softneck.core import FileFormatError, SettingsError, load
 from softneck.identification import GreyBox, Model
 from softneck.identification.structured._greybox import PARAMETERS
-from softneck.identification.structured._parameters import RIGID
+from softneck.identification.structured._parameters import BODY_PARAMETERS, RIGID
 from softneck.runtime import load_functions
 from softneck.signals import SET_POINTS, Recording, signal
 from softneck.signals.recording._channels import MOTOR_POSITIONS
@@ -21,19 +21,27 @@ from ...data import TS
 FUNCTIONS = load_functions("softneck.identification.structured._neck_equations_runtime")
 GUESS = np.array([number.guess for number in PARAMETERS])
 REACH = 0.35
-CREEP = np.array([REACH, 0.0, 0.0, 0.8, 1.0])
 
 
-def run(body: np.ndarray, U: np.ndarray, numbers: np.ndarray = GUESS) -> tuple[np.ndarray, np.ndarray]:
+def body(**numbers: float) -> np.ndarray:
+    """The array `body` with some of its numbers."""
+    found = dict(zip([number.name for number in BODY_PARAMETERS], RIGID[1:], strict=True)) | numbers
+    return np.array([REACH, *found.values()])
+
+
+CREEP = body(creep=0.8)
+
+
+def run(p: np.ndarray, U: np.ndarray, numbers: np.ndarray = GUESS) -> tuple[np.ndarray, np.ndarray]:
     M, Y = np.empty(U.shape), np.empty((len(U), 2))
-    FUNCTIONS.neck_run(numbers, body, TS, np.full(3, 3.0), 2, 50, np.ascontiguousarray(U), np.zeros(3), M, Y)
+    FUNCTIONS.neck_run(numbers, p, TS, np.full(3, 3.0), 2, 50, np.ascontiguousarray(U), np.zeros(3), M, Y)
     return M, Y
 
 
-def recording(body: np.ndarray, name: str, seed: int, rows: int = 1000) -> Recording:
+def recording(p: np.ndarray, name: str, seed: int, rows: int = 1000) -> Recording:
     U = np.array(signal(name, duration=rows * TS, seed=seed).set_points)
     U[:10] = 0.0
-    M, Y = run(body, U)
+    M, Y = run(p, U)
     Y = Y + 5e-4 * np.random.default_rng(seed).standard_normal(Y.shape)
     channels = dict(zip((*SET_POINTS, *MOTOR_POSITIONS, "pitch", "roll"), (*U.T, *M.T, *Y.T), strict=True))
     return Recording(np.arange(len(U)) * TS, TS, channels)
@@ -61,19 +69,64 @@ def test_a_body_creeps_from_the_bend_of_both_springs_to_that_of_one() -> None:
 
 
 def test_softening_bends_further_beyond_half_the_reach_and_less_below() -> None:
-    soft = np.array([REACH, 2.0, 0.0, 0.0, 1.0])
+    soft = body(softening=2.0)
     for size, further in ((0.4, False), (3.0, True)):
-        bends = [abs(run(body, held(size, 300))[1][-1, 0]) for body in (soft, RIGID)]
+        bends = [abs(run(p, held(size, 300))[1][-1, 0]) for p in (soft, RIGID)]
         assert (bends[1] > 0.5 * REACH) == further
         assert (bends[0] > bends[1]) == further
 
 
 def test_a_large_bend_leaves_the_body_softer_for_a_while() -> None:
-    lasting = np.array([REACH, 0.0, 0.6, 0.0, 1.0])
+    lasting = body(lasting_softening=0.6)
     before = np.vstack([held(3.0, 200), held(0.0, 100), held(0.5, 200)])
-    gained = [run(body, before)[1][-1, 0] - run(body, held(0.5, 500))[1][-1, 0] for body in (lasting, RIGID)]
+    gained = [run(p, before)[1][-1, 0] - run(p, held(0.5, 500))[1][-1, 0] for p in (lasting, RIGID)]
     # The rigid body differs by its hysteresis alone.
     assert gained[0] > 5.0 * abs(gained[1])
+
+
+def pulled(motor: int, size: float, p: np.ndarray) -> np.ndarray:
+    """The bend, a vector, after one motor has pulled and the others have given way."""
+    U = np.roll(held(size, 300), motor, axis=1)
+    pitch, roll = run(p, U)[1][-1]
+    direction = np.array([np.tan(pitch), np.tan(roll)])
+    return np.arctan(np.linalg.norm(direction)) * direction / np.linalg.norm(direction)
+
+
+def turned(b: np.ndarray, degrees: float) -> np.ndarray:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([c * b[0] - s * b[1], s * b[0] + c * b[1]])
+
+
+def test_lobes_are_the_same_after_a_third_of_a_turn_and_stiffer_towards_one() -> None:
+    lobed = body(lobe_pitch=0.4)
+    for motor in (1, 2):
+        # The equations have no other direction; what is left is rounding.
+        np.testing.assert_allclose(pulled(motor, 2.0, lobed), turned(pulled(0, 2.0, lobed), 120.0 * motor), atol=1e-9)
+    assert pulled(0, 2.0, lobed)[0] < pulled(0, 2.0, RIGID)[0] < pulled(0, 2.0, body(lobe_pitch=-0.4))[0]
+    # Lobes beside the pull push the link aside.
+    assert abs(pulled(0, 2.0, body(lobe_roll=0.4))[1]) > 0.005 > abs(pulled(0, 2.0, lobed)[1])
+
+
+def test_coupling_is_an_asymmetry_turned_by_45_deg() -> None:
+    names = [number.name for number in PARAMETERS]
+    numbers = GUESS.copy()
+    numbers[names.index("asymmetry")] = 0.3
+    U = held(2.0, 300)
+    straight = run(RIGID, U, numbers)[1][-1]
+    turned_numbers = GUESS.copy()
+    turned_numbers[names.index("twist")] = np.radians(45.0)
+    across = run(body(coupling=0.3), U, turned_numbers)[1][-1]
+    # Tilts of a bend b are those of the turned bend: tan(pitch), tan(roll) turn as a vector.
+    np.testing.assert_allclose(np.tan(across), turned(np.tan(straight), 45.0), atol=1e-9)
+
+
+def test_a_link_at_its_stop_is_compressed_a_tenth_as_far() -> None:
+    U = np.zeros((400, 3))
+    U[10:] = 2.0  # all tendons alike: it is compressed and does not bend
+    free, stopped = (run(p, U)[0][-1] for p in (RIGID, body(stop=20.0)))
+    # A stiffer link stretches the tendons more: its drives stall earlier.
+    assert (stopped < free - 0.1).all()
+    np.testing.assert_array_equal(run(body(stop=1e-9), U)[0], run(RIGID, U)[0])
 
 
 @pytest.fixture(scope="module")
@@ -96,13 +149,13 @@ def test_its_file_keeps_the_body(creeping: Model, tmp_path: Path) -> None:
     creeping.save(tmp_path / "m.npz")
     test = recording(CREEP, "sine", 3, 300)
     np.testing.assert_array_equal(load(tmp_path / "m.npz").simulate(test), creeping.simulate(test))
-    spoiled = {**creeping.arrays, "body": np.array([REACH, 0.0, 0.0, -1.0, 1.0])}
+    spoiled = {**creeping.arrays, "body": body(creep=-1.0)}
     replace(creeping, arrays=spoiled).save(tmp_path / "spoiled.npz")
     with pytest.raises(FileFormatError, match="body"):
         load(tmp_path / "spoiled.npz")
 
 
-@pytest.mark.parametrize("body", ["", "foam", "creep+creep", "rigid+creep"])
-def test_parts_that_do_not_exist_are_refused(body: str) -> None:
-    with pytest.raises(SettingsError, match="rigid, all, or some of softening, creep, tendons"):
-        GreyBox(body=body)
+@pytest.mark.parametrize("parts", ["", "foam", "creep+creep", "rigid+creep"])
+def test_parts_that_do_not_exist_are_refused(parts: str) -> None:
+    with pytest.raises(SettingsError, match="rigid, all, or some of anisotropy, stop, softening, creep, tendons"):
+        GreyBox(body=parts)

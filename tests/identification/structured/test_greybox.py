@@ -14,6 +14,7 @@ from softneck.core import load
 from softneck.identification import INFINITE, GreyBox, Model, validate
 from softneck.identification.structured._greybox import INTERRUPTED, PARAMETERS
 from softneck.identification.structured._output_error import intervals
+from softneck.identification.structured._parameters import RIGID
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
 from softneck.runtime import load_functions
@@ -26,7 +27,6 @@ FUNCTIONS = load_functions("softneck.identification.structured._neck_equations_r
 GUESS = np.array([number.guess for number in PARAMETERS])
 NAMES = [number.name for number in PARAMETERS]
 DELAY = np.full(3, 3.0)
-RIGID = np.array([1.0, 0.0, 0.0, 0.0, 1.0])
 
 
 def run(numbers: np.ndarray, U: np.ndarray, lines: int = 2) -> tuple[np.ndarray, np.ndarray]:
