@@ -32,8 +32,8 @@ from .linear._margins import LoopMargins as LoopMargins
 from .linear._margins import margins_of_loops as margins_of_loops
 from .linear._margins import polynomials_at as polynomials_at
 from .linear._own import own_attributes as own_attributes
-from .linear._own import own_controller as own_controller
 from .linear._own import own_module as own_module
+from .linear._own import own_object as own_object
 from .linear._ports import motor_ranges as motor_ranges
 from .linear._settings import AxisSettings as AxisSettings
 from .linear._settings import LoopSettings as LoopSettings

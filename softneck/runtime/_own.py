@@ -23,7 +23,7 @@ def state_size(p):
 
 def initialise(p, parameters, state, outputs):
     state[:] = OWN.start()
-    outputs[:] = 0.0
+    outputs[:] = OWN.first(outputs.size)
 
 
 def step(p, parameters, state, inputs, outputs):
@@ -42,6 +42,11 @@ class OwnStep:
         """Return the state at the start (n_state,); empty where the object has none."""
         begin = getattr(self.stepped, "initial_state", tuple)
         return np.array(begin(), dtype=np.float64).reshape(-1)
+
+    def first(self, count: int) -> np.ndarray:
+        """Return the outputs at the start (count,); zero where the object does not say."""
+        begin = getattr(self.stepped, "initial_outputs", None)
+        return np.zeros(count) if begin is None else np.array(begin(), dtype=np.float64)
 
     def step(self, state: np.ndarray, inputs: np.ndarray) -> tuple[Any, Any]:
         """Return the state one sample later and the outputs."""

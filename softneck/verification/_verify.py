@@ -20,7 +20,7 @@ from softneck.core import (
     one_blas_thread,
     shown_progress,
 )
-from softneck.design import own_controller
+from softneck.design import own_object
 from softneck.estimation import robot_of
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot, load_for_robot
@@ -254,7 +254,7 @@ def verify(
         >>> len(softneck.verify(softneck.design_controller("pi", model), {"rls": model}, asked).verdicts) > 10
         True
     """
-    begin, controller = time.perf_counter(), load_for_robot(own_controller(controller), "controller")
+    begin, controller = time.perf_counter(), load_for_robot(own_object(controller), "controller")
     observer = None if observer is None else load_for_robot(observer, "observer")
     robot, named = robot_of(controller), named_plants(plants)
     for what, thing in (*named.items(), *(() if observer is None else (("observer", observer),))):

@@ -8,8 +8,10 @@ from types import ModuleType
 from typing import Any
 
 import control
+import fmpy
 import numpy as np
 import pytest
+from fmpy.validation import validate_fmu
 
 import softneck
 from softneck.core import SettingsError
@@ -51,6 +53,37 @@ class Linear(Tilt):
                                   np.hstack([g * np.diag([1.5, 1.732]), -g * np.diag([1.5, 1.732])]), 0.02,
                                   inputs=names, outputs=["theta_i", "phi_i"])
 """
+PLANT = """
+class Finger:
+    role, sample_time = "plant", 0.01
+    inputs, outputs = {"chamber_setpoint": "Pa"}, {"flexion": "rad"}
+
+    def __init__(self, gain, rest=0.2):
+        self.gain, self.rest = gain, rest
+
+    def initial_state(self):
+        return [self.rest]
+
+    def initial_outputs(self):
+        return [self.rest]
+
+    def step(self, state, inputs):
+        y = 0.9 * state[0] + 0.1 * (self.rest + self.gain * inputs["chamber_setpoint"])
+        return [y], [y]
+
+
+class Neck(Finger):
+    sample_time = 0.02
+    inputs = {f"motor_setpoint_{j}": "rad" for j in (1, 2, 3)}
+    outputs = dict.fromkeys(["pitch", "roll", *(f"motor_position_{j}" for j in (1, 2, 3))], "rad")
+
+    def initial_outputs(self):
+        return [self.rest, 0.0, 0.0, 0.0, 0.0]
+
+    def step(self, state, inputs):
+        y = 0.9 * state[0] + 0.1 * (self.rest + self.gain * inputs["motor_setpoint_1"])
+        return [y], [y, 0.0, *inputs.values()]
+"""
 FUNCTIONS = """
 def state_size(arrays):
     return 2
@@ -85,6 +118,16 @@ def tilt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     import own_tilt  # pyright: ignore[reportMissingImports]
 
     return own_tilt
+
+
+@pytest.fixture
+def own_plants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    (tmp_path / "own_plants.py").write_text(PLANT, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_plants", raising=False)
+    import own_plants  # pyright: ignore[reportMissingImports]
+
+    return own_plants
 
 
 def test_an_object_and_a_module_of_functions_make_one_loop(tilt: ModuleType) -> None:
@@ -149,3 +192,44 @@ def test_what_does_not_fit_is_said(tilt: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "own_tilt.py").write_text("import control\n" + TEXT, encoding="utf-8")
     with pytest.raises(SettingsError, match="its file imports `control`"):
         softneck.build_fmu(tilt.Tilt(1.0), tmp_path / "Control.fmu")
+
+
+def test_a_plant_of_ones_own_is_an_fmu_with_its_ports(tmp_path: Path, own_plants: ModuleType) -> None:
+    path = softneck.build_fmu(own_plants.Finger(2e-5), tmp_path / "Finger.fmu")
+    assert validate_fmu(str(path)) == []
+    model = fmpy.read_model_description(str(path))
+    named = {v.name: (v.causality, v.unit) for v in model.modelVariables}
+    assert named == {"chamber_setpoint": ("input", "Pa"), "flexion": ("output", "rad")}
+    signals = np.array([(0.0, 5e4), (1.0, 5e4)], dtype=[("time", float), ("chamber_setpoint", float)])
+    result: Any = fmpy.simulate_fmu(str(path), input=signals, stop_time=0.2, output_interval=0.01)
+    # First order: y(k) = rest + gain u (1 - 0.9^k), at the sample itself; rounding of twenty steps.
+    expected = 0.2 + 1.0 * (1.0 - 0.9 ** np.arange(21))
+    np.testing.assert_allclose(result["flexion"], expected, rtol=1e-13)
+
+
+def test_a_loop_takes_a_plant_of_ones_own_and_its_fmu(tmp_path: Path, tilt: ModuleType, own_plants: ModuleType) -> None:
+    plant, loop = own_plants.Neck(0.05, rest=0.01), {**LOOP, "controller": tilt.Tilt(1.0)}
+    ours = softneck.simulate({**loop, "plant": plant})
+    softneck.build_fmu(plant, tmp_path / "Own.fmu")
+    theirs = softneck.simulate({**loop, "plant": {"fmu": str(tmp_path / "Own.fmu")}})
+    assert ours["pitch"][0] == 0.01
+    assert np.ptp(ours["pitch"]) > 0.01
+    np.testing.assert_array_equal(ours["pitch"], theirs["pitch"])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"role": "motor"}, "`role` is 'motor'; use one of controller, plant, observer"),
+        ({"inputs": ["chamber_setpoint"]}, "a plant needs `inputs`, a dictionary of names and SI units"),
+        ({"outputs": {"flexion": "deg"}}, "a plant needs `outputs`, a dictionary of names and SI units"),
+        ({"outputs": {"flexion": "rad", "tip": "m"}}, r"must return \(1 state, 2 outputs\)"),
+        ({"initial_outputs": list}, "`initial_outputs` must return 1 numbers"),
+    ],
+)
+def test_a_wrong_declaration_is_said(
+    change: dict[str, Any], words: str, tmp_path: Path, own_plants: ModuleType
+) -> None:
+    plant = type("Wrong", (own_plants.Finger,), change)(1.0)
+    with pytest.raises(SettingsError, match=words):
+        softneck.build_fmu(plant, tmp_path / "Wrong.fmu")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load, require_file, settings_text
-from softneck.design import own_controller
+from softneck.design import own_object
 from softneck.loop import AheadReference, BlockPart, Link, Part, RecordingReference, Reference, make_reference
 from softneck.plant import PRESETS, NeckParameters, VirtualNeck
 from softneck.robot import Robot, find_robot
@@ -191,7 +191,7 @@ class PartOpener:
             )
         key, value = given[0], table[given[0]]
         if key == OBJECT:
-            value = own_controller(value) if name == "controller" else value
+            value = own_object(value) if name == "controller" else value
             self._note_robot(name, value)
             return _part_of(name, value)
         if not isinstance(value, str):
@@ -294,8 +294,8 @@ def _with_names(ports: tuple[Port, ...], names: Mapping[str, str]) -> tuple[Port
 
 
 def _part_of(name: str, made: Any, verb: str = " is") -> Part:
-    """Return a part from a part, a block, an object with `block()`, or a controller of the user."""
-    made = own_controller(made) if name == "controller" else made
+    """Return a part from a part, a block, an object with `block()`, or an object of the user."""
+    made = own_object(made) if name == getattr(made, "role", "controller") else made
     made = made.block() if hasattr(made, "block") and not hasattr(made, "advance") else made
     if isinstance(made, Block):
         return BlockPart(made)

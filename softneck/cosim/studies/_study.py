@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import FileFormatError, Matrix, ReprMixin, SettingsError, SoftneckError, file_hash
-from softneck.design import own_attributes, own_controller
+from softneck.design import own_attributes, own_object
 from softneck.loop import Loop, LoopRun, error_unit, metric_names, reference_field
 from softneck.robot import Robot, find_robot
 from softneck.runtime import Block
@@ -465,7 +465,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     block = value.block() if callable(getattr(value, "block", None)) else value
-    if own_controller(value) is not value:
+    if own_object(value) is not value:
         return {OBJECT: type(value).__qualname__, "attributes": repr(own_attributes(value))}
     if not isinstance(block, Block):
         return {OBJECT: f"{type(value).__module__}.{type(value).__qualname__}"}

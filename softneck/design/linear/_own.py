@@ -1,4 +1,4 @@
-"""Controllers of one's own, written in Python: objects that step, and modules of functions that are compiled."""
+"""Controllers, plants and observers of one's own in Python: objects that step, and modules that are compiled."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, ReprMixin, SettingsError, require_positive
+from softneck.core import Matrix, ReprMixin, SettingsError, require_positive, to_si
 from softneck.robot import Robot, find_robot
 from softneck.runtime import PREFIX, Block, OwnStep, Port, bundle, own_of, own_runtime
 
@@ -70,8 +70,31 @@ class OwnController(ReprMixin):
         return f"{self._name}: a controller of one's own, {1e3 * self.sample_time:g} ms"
 
 
-class ObjectController(ReprMixin):
-    """An object with `step(state, inputs) -> (state, outputs)` as a controller; see docs/howto/own_controller.md.
+_ROLES = ("controller", "plant", "observer")
+
+
+def _ports(stepped: Any, robot: Robot) -> tuple[str, tuple[Port, ...], tuple[Port, ...]]:
+    """Return role, inputs and outputs of an object: a robot's controller, or what it declares itself."""
+    name, role = type(stepped).__name__, getattr(stepped, "role", _ROLES[0])
+    if role not in _ROLES:
+        raise SettingsError(f"{name}: `role` is {role!r}; use one of {', '.join(_ROLES)}.")
+    if role == _ROLES[0]:
+        return role, controller_inputs(robot), controller_outputs(robot)
+    tables = []
+    for what in ("inputs", "outputs"):
+        units: Any = getattr(stepped, what, None)
+        known = isinstance(units, Mapping) and all(isinstance(one, str) for one in (*units, *units.values()))
+        if not known or any(to_si(unit)[1] != unit for unit in units.values()):
+            raise SettingsError(
+                f'{name}: a {role} needs `{what}`, a dictionary of names and SI units like {{"flexion": "rad"}}; '
+                f"got {units!r}."
+            )
+        tables.append(tuple(Port(name=port, unit=unit) for port, unit in units.items()))
+    return role, *tables
+
+
+class OwnObject(ReprMixin):
+    """An object with `step(state, inputs) -> (state, outputs)` as a block; see docs/howto/own_controller.md.
 
     Attributes:
         robot, order: as the object's attributes say, else a neck's and "sequential".
@@ -88,20 +111,26 @@ class ObjectController(ReprMixin):
             self.ss = stepped.ss
         step = float(getattr(stepped, "sample_time", 0.02))
         require_positive("sample_time", step, "s")
-        inputs, outputs = controller_inputs(self.robot), controller_outputs(self.robot)
+        role, inputs, outputs = _ports(stepped, self.robot)
         own = OwnStep(stepped, [port.name for port in inputs])
         name = type(stepped).__name__
         try:
+            first = own.first(len(outputs))
             state, made = own.step(own.start(), np.array([port.start for port in inputs]))
         except Exception as error:  # whatever the user's own code raises
             raise SettingsError(f"{name}: its first step fails with {type(error).__name__}: {error}.") from error
         if state.shape != own.start().shape or made.shape != (len(outputs),):
+            what = "set-points" if role == _ROLES[0] else "outputs"
             raise SettingsError(
-                f"{name}: `step` must return ({own.start().size} state, {len(outputs)} set-points); it returned "
+                f"{name}: `step` must return ({own.start().size} state, {len(outputs)} {what}); it returned "
                 f"shapes {state.shape} and {made.shape}."
             )
+        if first.shape != made.shape:
+            raise SettingsError(
+                f"{name}: `initial_outputs` must return {len(outputs)} numbers; got shape {first.shape}."
+            )
         self._block = Block(
-            kind=name, role="controller", runtime=own_runtime(own), sample_time=step, arrays=(), inputs=inputs,
+            kind=name, role=role, runtime=own_runtime(own), sample_time=step, arrays=(), inputs=inputs,
             outputs=outputs,
         )  # fmt: skip
 
@@ -111,14 +140,14 @@ class ObjectController(ReprMixin):
 
     def summary(self) -> str:
         """Return one line on the controller."""
-        return f"{self._block.kind}: a controller of one's own, {1e3 * self._block.sample_time:g} ms"
+        return f"{self._block.kind}: a {self._block.role} of one's own, {1e3 * self._block.sample_time:g} ms"
 
 
-def own_controller(thing: Any) -> Any:
-    """Return an object that steps as a controller with a block, everything else as it is."""
+def own_object(thing: Any) -> Any:
+    """Return an object that steps as one with a block, everything else as it is."""
     if isinstance(thing, str | Path | Mapping | type | Block) or hasattr(thing, "block") or hasattr(thing, "advance"):
         return thing
-    return ObjectController(thing) if callable(getattr(thing, "step", None)) else thing
+    return OwnObject(thing) if callable(getattr(thing, "step", None)) else thing
 
 
 def own_module(runtime: str) -> tuple[str, str]:

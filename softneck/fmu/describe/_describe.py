@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from softneck.core import KINDS, FileFormatError, SettingsError, percent, settings_text
-from softneck.design import own_controller
+from softneck.design import own_object
 from softneck.identification import Model, Validation
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import ROBOT_PRESETS, Robot, load_for_robot
@@ -165,7 +165,7 @@ def buildable(thing: Buildable | Block | str | Path, robot: str | Path | Robot |
 
     Raises FileFormatError: a file without a block; SettingsError: not a file, a preset or an object with a block.
     """
-    thing = own_controller(thing)
+    thing = own_object(thing)
     if not isinstance(thing, str | Path):
         if isinstance(thing, Block) or (hasattr(thing, "block") and not isinstance(thing, type)):
             return thing
