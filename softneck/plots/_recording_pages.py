@@ -73,7 +73,8 @@ def _doubts_section(
     if not doubts and not problems:
         findings.append(("ok", "every guess is at least 90 % sure."))
     method = "Left: columns as logged, by row. Right: channels of the recording over time, in the same colours."
-    return Section("Doubts", findings=findings, charts=charts, method=[method] if charts else [])
+    title = "Doubts" if doubts or problems else "Columns and channels"
+    return Section(title, findings=findings, charts=charts, method=[method] if charts else [])
 
 
 def _mapping(frame: pd.DataFrame, layout: Layout, recording: Recording | None) -> Section:

@@ -100,6 +100,8 @@ def _best_on(data: str, rivals: Sequence[Values]) -> str:
             for name, fit in fits.items()
         )
     said = [f"{'Do not use' if bad else 'Use'} {Path(best['model']).name}{of}: on {rows} {how}."]
+    if trained := best.get("rows_trained", 0):
+        said.append(f"It was trained on {trained} of these rows: they say nothing about new motions.")
     if lost := [Path(one["model"]).name for one in rivals if one["diverged"] is not None]:
         said.append(f"Diverged: {', '.join(lost)}.")
     if (limits := trust_limits(best["measured_range"], best.get("unit", "deg"))) and not bad:

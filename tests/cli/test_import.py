@@ -132,6 +132,8 @@ def test_a_preview_shows_doubts_first_and_what_was_made(call: Call, tmp_path: Pa
     assert order == sorted(order)
     by_layout = call("import", "log.csv", "--layout", "r.layout.toml", "-o", "s.csv", "--html", "q.html")
     assert by_layout.code == 0
+    # A layout leaves nothing to doubt, and the page has no section of doubts.
+    assert "Doubts" not in (tmp_path / "q.html").read_text()
     kept = call("import", "log.csv", "--layout", "r.layout.toml", "-o", "t.csv", "--html", "q.html")
     assert "q.html: exists already" in kept.error
     assert not (tmp_path / "t.csv").exists()

@@ -94,6 +94,10 @@ def test_validate_decides_for_the_best_model_and_says_where_to_stop(entry: dict[
         "linear fit of these rows, 81.5 %), twist 93.5 % (very good). Do not trust it outside flexion -1.25 "
         "to 17.5 mm: it was not judged there."
     )
+    assert "trained" not in validation_decision([{**entry, "rows_trained": 0}])
+    assert "It was trained on 120 of these rows: they say nothing about new motions." in validation_decision(
+        [{**entry, "rows_trained": 120}]
+    )
     lost = {**worse, "diverged": 3.0}
     assert "Diverged: b.npz." in validation_decision([lost, entry])
     assert validation_decision([lost]).startswith("Do not use b.npz: ")

@@ -25,6 +25,7 @@ from softneck.core import (
 from softneck.robot import Robot, load_for_robot
 from softneck.signals import Recording, RecordingLike, open_recording
 
+from ..models._fitting import known_rows
 from ..models._model import Model
 from ..models._validity import with_tolerance
 from ._baselines import Baselines, baselines
@@ -73,6 +74,7 @@ class Validation(ReprMixin):
     Attributes:
         model, data: their names.
         rows_scored, rows_left_out: rows judged, and rows left out because the model was trained on them.
+        rows_trained: rows judged although the model was trained on them (`include_training`).
         rows_by_horizon: rows judged at each horizon: those with so much past, and of long records not all.
         persistence, fits: fit [%] of repeating the last sample, and of the model.
         rmse_deg, r2: root mean square error [deg], of another robot in its `display_unit`; R2 = 1 - SSE/SST.
@@ -104,6 +106,7 @@ class Validation(ReprMixin):
     data: str
     rows_scored: int
     rows_left_out: int
+    rows_trained: int
     rows_by_horizon: dict[str, int]
     persistence: Scores
     fits: Scores
@@ -182,6 +185,7 @@ class Validation(ReprMixin):
             "data": self.data,
             "rows_scored": self.rows_scored,
             "rows_left_out": self.rows_left_out,
+            "rows_trained": self.rows_trained,
             "rows_by_horizon": self.rows_by_horizon,
             "measured_range": self.measured_range,
             "fits": {
@@ -288,6 +292,7 @@ class Parts:
 
     segments: list[ScoredSegment]
     left_out: int
+    trained: int
     rows: Rows
     baselines: Baselines
 
@@ -306,6 +311,7 @@ def judged_parts(
         raise DataError(f"neither {names} was ever measured; there is nothing to judge.")
     hashes = np.zeros(0, dtype=np.uint64) if rules.include_training else model.training_rows
     segments, left_out = unseen_segments(recording, hashes)
+    trained = int(known_rows(recording, model.training_rows).sum()) if rules.include_training else 0
     longest = max(len(s.recording) for s in segments)
     finite = [int(h) for h in rules.horizons if h != INFINITE]
     if finite and max(finite) >= longest:
@@ -318,7 +324,7 @@ def judged_parts(
     known = {} if known is None else known
     if key not in known:
         known[key] = baselines(segments, rows, rules.horizons)
-    return Parts(segments, left_out, rows, known[key])
+    return Parts(segments, left_out, trained, rows, known[key])
 
 
 def judge(model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str]) -> Validation:
@@ -351,6 +357,7 @@ def judge(model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str]) -
         data=names[1],
         rows_scored=int(sum(segment.scored.sum() for segment in parts.segments)),
         rows_left_out=parts.left_out,
+        rows_trained=parts.trained,
         rows_by_horizon={h: int(np.isfinite(y).any(axis=1).sum()) for h, y in measured.items()},
         persistence=parts.baselines.persistence,
         **scores,

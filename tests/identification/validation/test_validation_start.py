@@ -75,7 +75,9 @@ def test_a_model_that_memorises_is_not_scored_on_what_it_has_seen() -> None:
     flattered = validate(model, seen, horizons=(1,), include_training=True)
     assert number(flattered.fits["1"]["pitch"]) > 99.9  # it has seen exactly these rows
     assert number(flattered.fits["1"]["pitch"]) > number(clean.fits["1"]["pitch"]) + 5
-    assert flattered.rows_left_out == 0
+    assert (flattered.rows_left_out, flattered.rows_trained) == (0, 500)
+    half = validate(model, concatenate([others[0], seen]), horizons=(1,), include_training=True)
+    assert (half.rows_trained, mixed.rows_trained) == (500, 0)
 
 
 def test_rows_seen_inside_a_run_are_left_out_and_the_rest_stays_two_segments() -> None:
