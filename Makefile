@@ -38,10 +38,10 @@ docs: $(VENV)/.documented
 benchmark: $(VENV)/.tested
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
 
-# Every kind of FMU in every independent tool that is here; what is absent is "not run". docs/howto/conformance.md has the
-# table.
+# Every kind of FMU in every independent tool that is here, in Co-Simulation and Model Exchange; what is absent is
+# "not run". It writes the table of docs/howto/conformance.md.
 conformance: $(VENV)/.tested
-	$(BIN)/python -m tests.fmu.conformance
+	$(BIN)/python -m tests.fmu.conformance --page docs/howto/conformance.md
 
 # Mutation tests of the code for safety and certificates: change one thing at a time and see whether a test fails. An hour
 # or more for all; `make mutate AREAS="master loop"` tries some. docs/howto/nightly.md has the figures.

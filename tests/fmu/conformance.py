@@ -1,16 +1,17 @@
-"""Run every kind of FMU, of both backends, in every independent tool that is here: `make conformance`.
+"""Run every kind of FMU, of both backends and interfaces, in every independent tool that is here: `make conformance`.
 
-    python -m tests.fmu.conformance [--out build/conformance.md] [--add] [--backend B]... [--tool T]... [KIND...]
+    python -m tests.fmu.conformance [--out FILE] [--page PAGE] [--add] [--backend B]... [--tool T]... [KIND...]
 
 Tools that registries offer come with the dependency group `importers`; others are taken where PATH has them. One that
-is not here is "not run". What a tool computes is held against the block's own run; a checker is
-believed by its exit code. `--add` takes in the kinds of an earlier run with the same tools: some kinds at a time.
-Exit code 1 where anything fails.
+is not here is "not run". What a tool computes is compared with the block's own run; the result of a checker is its exit
+code. `--add` takes in the kinds of an earlier run with the same tools: some kinds at a time. `--page` writes the table
+between the two marks of a page. Exit code 1 where anything fails.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import datetime
 import json
 import os
@@ -21,7 +22,7 @@ import sys
 import sysconfig
 import tempfile
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -42,10 +43,14 @@ from ._omsimulator import outputs_in_omsimulator
 HERE = Path(__file__).parent
 GOLDEN = HERE.parent / "golden"
 KINDS = (
-    "rls", "rls_mimo", "nlsm", "nlsm_residual", "nn", "play", "greybox", "guarded", "neck",
-    "kalman", "nonlinear", "pi", "fopi", "hinf", "adaptive", "mpc",
+    "rls", "rls_mimo", "oe", "nlsm", "nlsm_residual", "nn", "play", "greybox", "guarded", "neck",
+    "kalman", "nonlinear", "pi", "pid", "lqg", "fopi", "hinf", "adaptive", "mpc",
 )  # fmt: skip
 BACKENDS = ("python 2.0", "compiled 2.0", "compiled 3.0")
+CS, ME = "CS", "ME"
+# Of a checker that reads the file, or runs both by itself.
+FILE, BOTH = "file", "CS, ME"
+MARKS = ("<!-- conformance: written by make conformance -->", "<!-- end of conformance -->")
 ROWS = 40
 # Of the size of a signal: the library adds in another order than numpy, observers divide by small numbers.
 SAME = 1e-9
@@ -76,13 +81,17 @@ class Tool:
         name: in the table.
         found: its version, "" where it is not here.
         backends: those it is for.
-        ask: returns "" or what is wrong.
+        ask: interface -> what returns "" or what is wrong. Model Exchange is asked of compiled FMUs only.
     """
 
     name: str
     found: Callable[[], str]
     backends: tuple[str, ...]
-    ask: Callable[[Case], str]
+    ask: dict[str, Callable[[Case], str]]
+
+    def places(self) -> Iterator[tuple[str, str]]:
+        """Yield backend and interface of each of its rows."""
+        yield from ((b, i) for b in self.backends for i in self.ask if (b, i) != (BACKENDS[0], ME))
 
 
 def block_of(kind: str) -> Block:
@@ -173,12 +182,78 @@ def fmpy_says(case: Case) -> str:
     stop = (ROWS - 1) * case.block.sample_time
     step = case.block.sample_time
     result = fmpy.simulate_fmu(
-        str(case.path), input=signals, output=names, stop_time=stop, output_interval=step, step_size=step
-    )
+        str(case.path), fmi_type="CoSimulation", input=signals, output=names, stop_time=stop, output_interval=step,
+        step_size=step,
+    )  # fmt: skip
     # Row k of fmpy's table is what a step of row k - 1 left.
     seen = np.array([[float(row[name]) for name in names] for row in result])[1:ROWS]
     short = Case(case.block, case.path, case.inputs[: ROWS - 1], case.expected[: ROWS - 1])
     return compared(short, seen)
+
+
+def around_samples(case: Case) -> tuple[list[str], np.ndarray]:
+    """Return names and table (2 ROWS, 1 + names) of time and measured inputs, constant around each sample."""
+    step, given = case.block.sample_time, [i for i, start in enumerate(case.inputs[0]) if np.isfinite(start)]
+    time = np.repeat(np.arange(ROWS) * step, 2) + np.tile([-0.25 * step, 0.25 * step], ROWS)
+    return [case.block.inputs[i].name for i in given], np.column_stack(
+        [time, np.repeat(case.inputs[:, given], 2, axis=0)]
+    )
+
+
+def in_events(case: Case) -> Case:
+    """Return `case` with what Model Exchange shows in the event of each sample: a plant's outputs at that time."""
+    if case.block.role != "plant":
+        return case
+    first = case.block.initial_state().outputs
+    return Case(case.block, case.path, case.inputs, np.vstack([first, case.expected[:-1]]))
+
+
+def last_of_each(case: Case, time: np.ndarray, outputs: np.ndarray, first: int) -> np.ndarray:
+    """Return the last row of `outputs` at the samples `first`, `first` + 1, ..: the one after its event."""
+    numbers = time / case.block.sample_time
+    rows = {round(n): i for i, n in enumerate(numbers) if abs(n - round(n)) < 1e-6}  # times are rounded sums
+    return outputs[[rows[n] for n in range(first, first + ROWS)]]
+
+
+def fmpy_exchange(case: Case) -> str:
+    """Return where Model Exchange in fmpy, by CVode, shows something else."""
+    names, table = around_samples(case)
+    booleans = {port.name for port in case.block.inputs if port.boolean}
+    signals = np.array(
+        list(map(tuple, table)), [("time", float), *((name, bool if name in booleans else float) for name in names)]
+    )
+    step, outputs = case.block.sample_time, [port.name for port in case.block.outputs]
+    result = fmpy.simulate_fmu(
+        str(case.path), fmi_type="ModelExchange", solver="CVode", input=signals, output=outputs,
+        stop_time=(ROWS - 0.5) * step, output_interval=step, record_events=True,
+    )  # fmt: skip
+    seen = np.array([[float(row[name]) for name in outputs] for row in result])
+    return compared(in_events(case), last_of_each(case, np.array(result["time"]), seen, 0))
+
+
+def fmusim_says(interface: str) -> Callable[[Case], str]:
+    """Return how fmusim (of the Reference FMUs) is asked, in one of its interfaces."""
+
+    def ask(case: Case) -> str:
+        names, table = around_samples(case)
+        with tempfile.TemporaryDirectory() as folder:
+            given, out = Path(folder) / "in.csv", Path(folder) / "out.csv"
+            np.savetxt(given, table, fmt="%.17g", delimiter=",", header=",".join(["time", *names]), comments="")
+            times = ["--stop-time", repr(ROWS * case.block.sample_time)]
+            times += ["--output-interval", repr(case.block.sample_time)]
+            files = ["--input-file", str(given), "--output-file", str(out)] if names else ["--output-file", str(out)]
+            done = ran(["fmusim", "--interface-type", interface.lower(), *times, *files, str(case.path)])
+            if done.returncode:
+                return last_line(done)
+            with out.open(encoding="utf-8") as file:
+                rows = list(csv.DictReader(file))
+        seen = np.array([[float(row[port.name]) for port in case.block.outputs] for row in rows])
+        time = np.array([float(row["time"]) for row in rows])
+        if interface == ME:
+            return compared(in_events(case), last_of_each(case, time, seen, 0))
+        return compared(case, last_of_each(case, time, seen, 1))
+
+    return ask
 
 
 def c_host(case: Case) -> str:
@@ -258,36 +333,36 @@ def command_version(command: str, *arguments: str) -> Callable[[], str]:
         done = ran([command, *arguments])
         lines = (done.stdout or done.stderr).strip().splitlines()
         told = lines and not lines[0].startswith("Usage")
-        return lines[0].split(" build date")[0][:60] if told else "version not said"
+        return lines[0].split(" build date")[0].removeprefix(f"{command} ")[:60] if told else "version not said"
 
     return found
 
 
 ALL, TWO = BACKENDS, BACKENDS[:2]
 TOOLS = (
-    Tool("fmpy", packaged("fmpy"), ALL, fmpy_says),
-    Tool("our host in C", command_version("cc", "--version"), BACKENDS[1:2], c_host),
-    Tool("fmutool", packaged("fmu-manipulation-toolbox"), ALL, fmutool_says),
-    Tool("libcosim", packaged("libcosimpy"), TWO, importer("libcosim")),
-    Tool("ecos", packaged("ecospy"), ALL, importer("ecos")),
-    Tool("pathsim-fmi", packaged("pathsim-fmi"), ALL, importer("pathsim")),
+    Tool("fmpy", packaged("fmpy"), ALL, {CS: fmpy_says, ME: fmpy_exchange}),
+    Tool("our host in C", command_version("cc", "--version"), BACKENDS[1:2], {CS: c_host}),
+    Tool("fmutool", packaged("fmu-manipulation-toolbox"), ALL, {FILE: fmutool_says}),
+    Tool("libcosim", packaged("libcosimpy"), TWO, {CS: importer("libcosim")}),
+    Tool("ecos", packaged("ecospy"), ALL, {CS: importer("ecos")}),
+    Tool("pathsim-fmi", packaged("pathsim-fmi"), ALL, {CS: importer("pathsim")}),
     Tool(
-        "fmusim", command_version("fmusim", "--version"), BACKENDS[1:],
-        on_path("fmusim", "--interface-type", "cs", "--stop-time", "{stop}", "{fmu}"),
+        "fmusim", command_version("fmusim", "--version"), BACKENDS[1:], {CS: fmusim_says(CS), ME: fmusim_says(ME)}
     ),
     Tool(
-        "fmuCheck", command_version("fmuCheck", "-v"), TWO, on_path("fmuCheck", "-h", "{step}", "-s", "{stop}", "{fmu}")
+        "fmuCheck", command_version("fmuCheck", "-v"), TWO,
+        {BOTH: on_path("fmuCheck", "-h", "{step}", "-s", "{stop}", "{fmu}")},
     ),
-    Tool("vdmcheck2", command_version("vdmcheck2", "-h"), TWO, on_path("vdmcheck2", "{fmu}")),
-    Tool("vdmcheck3", command_version("vdmcheck3", "-h"), BACKENDS[2:], on_path("vdmcheck3", "{fmu}")),
-    Tool("OMSimulator", command_version("OMSimulator", "--version"), ALL, omsimulator_says),
+    Tool("vdmcheck2", command_version("vdmcheck2", "-h"), TWO, {FILE: on_path("vdmcheck2", "{fmu}")}),
+    Tool("vdmcheck3", command_version("vdmcheck3", "-h"), BACKENDS[2:], {FILE: on_path("vdmcheck3", "{fmu}")}),
+    Tool("OMSimulator", command_version("OMSimulator", "--version"), ALL, {CS: omsimulator_says}),
 )  # fmt: skip
 
 
-def asked(tool: Tool, case: Case) -> str:
+def asked(ask: Callable[[Case], str], case: Case) -> str:
     """Return what is wrong with an FMU in a tool; what a tool throws is wrong too."""
     try:
-        return tool.ask(case)
+        return ask(case)
     except Exception as error:
         return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:120]}"
 
@@ -297,6 +372,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kinds", nargs="*", metavar="KIND", default=list(KINDS))
     parser.add_argument("--out", type=Path, default=Path("build/conformance.md"))
+    parser.add_argument("--page", type=Path, help="write the table into this page too")
     parser.add_argument("--add", action="store_true")
     parser.add_argument("--backend", action="append", choices=BACKENDS)
     parser.add_argument("--tool", action="append", choices=[tool.name for tool in TOOLS], help="none: all")
@@ -305,49 +381,53 @@ def main() -> int:
     found = earlier(told.out.with_suffix(".json"), here) if told.add else {}
     with tempfile.TemporaryDirectory() as name:
         for kind in told.kinds:
-            said = {}
+            said = found.setdefault(kind, {})
             for backend in told.backend or BACKENDS:
                 made = case(kind, backend, Path(name))
-                asks = [tool for tool in TOOLS if here[tool.name] and backend in tool.backends]
-                said |= {f"{tool.name}, {backend}": asked(tool, made) for tool in asks}
+                asks = [
+                    (place_of(tool, backend, interface), tool.ask[interface])
+                    for tool in TOOLS
+                    for one, interface in tool.places()
+                    if one == backend and here[tool.name]
+                ]
+                said |= {place: asked(ask, made) for place, ask in asks}
                 print(f"{kind}, {backend}", file=sys.stderr, flush=True)
-            found[kind] = {place: one for place, one in said.items() if one}
             told.out.parent.mkdir(parents=True, exist_ok=True)
             told.out.with_suffix(".json").write_text(json.dumps({"tools": here, "found": found}), encoding="utf-8")
-    wrong: dict[tuple[str, str], list[str]] = {(tool.name, backend): [] for tool in TOOLS for backend in BACKENDS}
-    for kind, places in found.items():
-        for (tool, backend), many in wrong.items():
-            many += [f"{kind}: {places[place]}"] if (place := f"{tool}, {backend}") in places else []
-    text = table(here, wrong, list(found), told.backend or BACKENDS)
+    text = table(here, found)
     told.out.write_text(text, encoding="utf-8")
+    if told.page:
+        before, after = told.page.read_text(encoding="utf-8").split(MARKS[0])
+        after = after.split(MARKS[1])[1]
+        told.page.write_text(f"{before}{MARKS[0]}\n\n{text}\n{MARKS[1]}{after}", encoding="utf-8")
     print(text)
-    return int(any(wrong.values()))
+    return int(any(wrong for places in found.values() for wrong in places.values()))
 
 
 def earlier(path: Path, here: dict[str, str]) -> dict[str, dict[str, str]]:
-    """Return what a run with the same tools found: kind -> tool and backend -> what is wrong."""
+    """Return what a run with the same tools found: kind -> tool, backend and interface -> "" or what is wrong."""
     kept = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     return kept["found"] if kept.get("tools") == here else {}
 
 
-def table(
-    here: dict[str, str],
-    wrong: dict[tuple[str, str], list[str]],
-    kinds: list[str],
-    backends: Sequence[str] = BACKENDS,
-) -> str:
-    """Return the table, and below what failed."""
+def place_of(tool: Tool, backend: str, interface: str) -> str:
+    """Return how a row of the table is called."""
+    return f"{tool.name}, {backend}, {interface}"
+
+
+def table(here: dict[str, str], found: dict[str, dict[str, str]]) -> str:
+    """Return the table, a row for each tool, FMU and interface, a column for each kind; below it what failed."""
     today = datetime.datetime.now(tz=datetime.UTC).date()
-    lines = [f"{len(kinds)} kinds, {today}, {platform.system()} {platform.machine()}: {', '.join(kinds)}.", ""]
-    lines += [f"| tool | version | {' | '.join(BACKENDS)} |", "|---" * (2 + len(BACKENDS)) + "|"]
+    lines = [f"{platform.system()} {platform.machine()}, {today}.", ""]
+    lines += ["|".join(["", "tool", "version", "FMU", "interface", *found, ""]), "|---" * (4 + len(found)) + "|"]
     for tool in TOOLS:
-        cells = []
-        for backend in BACKENDS:
-            good = len(kinds) - len(wrong[tool.name, backend])
-            shown = f"{good} of {len(kinds)}" if here[tool.name] and backend in backends else "not run"
-            cells.append(shown if backend in tool.backends else "-")
-        lines.append(f"| {tool.name} | {here[tool.name] or '-'} | {' | '.join(cells)} |")
-    failed = [f"- {tool}, {backend}: {one}" for (tool, backend), many in wrong.items() for one in many]
+        for backend, interface in tool.places():
+            said = [places.get(place_of(tool, backend, interface)) for places in found.values()]
+            cells = ["not run" if one is None else "fail" if one else "pass" for one in said]
+            lines.append("|".join(["", tool.name, here[tool.name] or "-", backend, interface, *cells, ""]))
+    failed = [
+        f"- {kind}: {place}: {wrong}" for kind, places in found.items() for place, wrong in places.items() if wrong
+    ]
     return "\n".join([*lines, "", *failed]).rstrip() + "\n"
 
 
