@@ -362,6 +362,8 @@ def _margin(item: _Margin, least: float) -> float:
     """Return the margin of one experiment [s or 1]; inf where it is not below `least`."""
     case, delay = item.experiment, item.experiment.what == "delay"
     none, limit = (0.0, item.limit / 1e3) if delay else (1.0, item.limit)
+    if least <= none:  # another experiment never comes to rest: no margin is smaller
+        return math.inf
     if not case.comes_to_rest(item.floor):
         return none
     if item.oscillates:

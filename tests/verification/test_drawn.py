@@ -403,6 +403,11 @@ def test_the_least_margin_of_a_draw_is_that_of_its_worst_experiment_in_its_unit(
     value, item = _drawn._least_margin([far, margin(Case("gain_up"), 2.0)])
     assert (value, item) == (pytest.approx(5.0, rel=0.006), far)
     assert _drawn._least_margin([margin(Case("gain_up"), 2.0)])[0] == math.inf
+    # Where one never comes to rest the margin is none, and no other experiment is tried with a delay of zero.
+    for what, none in (("gain_up", 1.0), ("delay", 0.0)):
+        restless, calm = margin(Case(what, rests=False), 2.0, oscillates=True), Case(what)
+        assert _drawn._least_margin([margin(calm, 2.0), restless])[0] == none
+        assert not calm.tried
     facts = _drawn._margin_facts(far, "draw 1", make_requirements({}))
     assert facts["kick_deg"] == pytest.approx(math.degrees(0.5))
     assert facts["posture_deg"] == pytest.approx([math.degrees(0.1), 0.0])
