@@ -166,6 +166,9 @@ def command(
         raise SettingsError("--sample-time goes with --guess; a layout says it as `sample_time_s` in [time].")
     if named is not None and (guess or layout_file is not None):
         raise SettingsError("--motor, --position and --output are the layout; leave out --guess and --layout.")
+    alone_output = _output_of_neck(log, named)
+    if alone_output is not None:
+        named, guess = None, True
     job = _Job(log, path, replace, force, html, yes, as_json, sample_time, known, robot, named)
     alone = ours or (not asked and sample_time is not None)
     if ours and asked:
@@ -202,12 +205,22 @@ def command(
         imported, layout, facts = _of_robot(job, whose, robot_out, known=known_robot, propose=propose)
         proposed = None
     elif layout_file is None:
-        proposed, imported, facts = _by_guess(job, whose)
+        proposed, imported, facts = _by_guess(job, whose, alone_output)
         layout = proposed.layout
     else:
         layout, proposed = signals.read_layout(layout_file, robot=whose), None
         imported = signals.import_log(log, layout)
     _finish(job, imported, facts, layout, proposed)
+
+
+def _output_of_neck(log: Path, named: signals.NamedColumns | None) -> str | None:
+    """Return "pitch" or "roll" if it alone was named and no column is called so: the rest is guessed."""
+    if named is None or named.motors or named.positions or len(named.outputs) != 1:
+        return None
+    (output,) = named.outputs
+    if output not in signals.OUTPUTS or signals.has_column(log, output) or signals.is_of_another_robot(log):
+        return None
+    return output
 
 
 def _can_guess(robot: Robot) -> bool:
@@ -270,12 +283,14 @@ def _preview(
     )
 
 
-def _by_guess(job: _Job, whose: Robot) -> tuple[signals.Guess, signals.ImportResult, dict[str, Any]]:
+def _by_guess(
+    job: _Job, whose: Robot, output: str | None = None
+) -> tuple[signals.Guess, signals.ImportResult, dict[str, Any]]:
     """Guess a layout, ask about its doubts, and import by it."""
     import tomli_w
 
     proposal = job.beside(".layout.toml")
-    guess = signals.guess_layout(job.log, robot=whose)
+    guess = signals.guess_layout(job.log, robot=whose, output=output)
     if job.clock is not None:
         if guess.layout.time is not None:
             raise SettingsError(f"{job.log}: has a clock; leave out --sample-time, or say --resample {job.clock:g}.")

@@ -96,11 +96,14 @@ def linear_plant(thing: Any, *, any_fit: bool, robot: Robot | str | Path | None 
     with fitting(path or "the model"):
         held_out = getattr(plant, "findings", {}).get("hold_out", {})
         diverged = held_out.get("diverged") is not None
-        least = min((fit for fit in held_out.get("fit", {}).values() if fit is not None), default=100.0)
-    if (diverged or least < _MIN_FIT_PCT) and not any_fit:
-        what = "diverges" if diverged else f"fits {percent(least)} %"
+        fits = {name: fit for name, fit in held_out.get("fit", {}).items() if fit is not None}
+        poor = {name: fit for name, fit in fits.items() if fit < _MIN_FIT_PCT}
+    if (diverged or poor) and not any_fit:
+        worst = min(poor, key=lambda name: poor[name], default="")
+        what = "diverges" if diverged else f"fits {percent(poor[worst])} % in {worst}"
+        without = f"Leave {', '.join(poor)} out of `outputs.names` in a robot.toml. " if len(poor) < len(fits) else ""
         raise SettingsError(
             f"{path and path + ': '}its simulation over the rows held out {what}; {_MIN_FIT_PCT:g} % is the least to "
-            "design on. Identify a better model, or go on by --any-fit (`any_fit=True`)."
+            f"design on. {'' if diverged else without}Identify a better model, or go on by --any-fit (`any_fit=True`)."
         )
     return plant

@@ -38,6 +38,7 @@ from .importing._log import read_log as read_log
 from .importing._robot_guess import NamedColumns as NamedColumns
 from .importing._robot_guess import columns_line as columns_line
 from .importing._robot_guess import guess_robot as guess_robot
+from .importing._robot_guess import has_column as has_column
 from .importing._robot_guess import is_of_another_robot as is_of_another_robot
 from .importing._robot_guess import layout_for as layout_for
 from .importing.formats._mcap import LARGEST_RECORD as LARGEST_RECORD

@@ -106,7 +106,8 @@ def test_design_refuses_a_model_that_explains_less_than_half(
     said = call("design", "pi", "m.npz", "-o", "pi.npz")
     assert said.code == code, said.err
     if code == 2:
-        assert f"m.npz: its simulation over the rows held out fits {fit} %; 30 % is the least" in said.error
+        assert f"m.npz: its simulation over the rows held out fits {fit} % in roll; 30 % is the least" in said.error
+        assert "Leave roll out of `outputs.names` in a robot.toml." in said.error
         assert call("design", "pi", "m.npz", "-o", "pi.npz", "--any-fit").code == 0
 
 

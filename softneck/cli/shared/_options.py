@@ -73,7 +73,7 @@ def requirements_option(default_text: str) -> Callable:
 def columns_options(function: Callable) -> Callable:
     """Add the options that name the columns of a log."""
     for option, name, what in (
-        ("--output", "outputs", "is the next output, such as an angle"),
+        ("--output", "outputs", "is the next output, such as an angle; pitch or roll: of a neck's log that one alone"),
         ("--position", "positions", "is the next motor's measured position"),
         ("--motor", "motors", "is the next motor's set-point"),
     ):

@@ -171,6 +171,7 @@ def _import(log: str, recording: str, options: Options) -> Step:
         columns = (("--motor", options.motors), ("--position", options.positions), ("--output", options.outputs))
         if named := [word for option, titles in columns for title in titles for word in (option, title)]:
             words = named + ([] if options.sample_time is None else ["--sample-time", options.sample_time])
+            words += ["--yes"] if options.yes else []
             settings += f", {shlex.join(named)}"
             whose = None if options.robot is None else whose  # else it is of what was named before
         words += ["--html", page] + ([] if whose is None else ["--robot", whose])

@@ -24,6 +24,7 @@ from softneck.core import (
     require_file,
     settings_text,
 )
+from softneck.robot import Robot
 
 from .._import import is_terminal
 from ..shared._console import note, percent, print_json, print_table
@@ -47,7 +48,7 @@ _SECOND_VISIT = (
     "to accept that: --requirements {folder}/tune/requirements.toml; to have more: record another motion (`softneck "
     "record mixed`, `softneck drives record mixed`) and start with both logs, as more motions leave fewer models"
 )
-_WITHOUT = re.compile(r"Leave .* out of `outputs\.names` in a robot\.toml")
+_WITHOUT = re.compile(r"Leave (\w+(?:, \w+)*) out of `outputs\.names` in a robot\.toml")
 # Sentences end where the next begins with a capital; `0.5 %.` within one does not.
 _FIRST_SENTENCE = re.compile(r"(?:[^:]*\.(?:csv|npz): )?((?s:.*?)[^.\s]\.)(?=\s+[`A-Z]|$)")
 
@@ -182,14 +183,22 @@ def _with_advice(error: SoftneckError, run: ProjectRun, folder: Path, logs: tupl
     if stage == "identification" and not between:  # the lacking excitation was printed before
         note(_MIXED_ADVICE)
         first = _FIRST_SENTENCE.match(said)
-        without = _WITHOUT.search(said)  # an output: that needs no other recording
-        return CheckFailedError(
-            _shorten(f"{stage}: {first[1] if first else said}", f"{without[0]}." if without else _NEXT_RECORDING)
-        )
+        return CheckFailedError(_shorten(f"{stage}: {first[1] if first else said}", _without(said) or _NEXT_RECORDING))
     if stage == "tune":
         note(_OWN_REQUIREMENTS)
     note(f"paths are those in {folder}; fix this and run the same command again")
     return type(error)(_shorten(f"{stage}: {said}"))
+
+
+def _without(said: str) -> str:
+    """Return the advice to go on without an output, which needs no other recording; empty if that is no way out."""
+    found = _WITHOUT.search(said)
+    if found is None:
+        return ""
+    good = [name for name in signals.OUTPUTS if name != found[1]]
+    if len(good) == 1 and Robot.read("robot.toml").outputs.names == signals.OUTPUTS:
+        return f"Go on without {found[1]}: --output {good[0]}."
+    return f"{found[0]}."
 
 
 def _shorten(said: str, advice: str = "") -> str:

@@ -15,7 +15,7 @@ from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, NECK, OUTPU
 from ..recording._resampling import jitter
 from ._clocks import SampleTime, estimate_sample_time
 from ._draft import SURE, Doubt, Draft, column_label, percent
-from ._guess_names import by_names, drop_or_turn_quaternion, one_axis, use_positions_as_inputs
+from ._guess_names import by_names, drop_or_turn_quaternion, of_one_output, one_axis, use_positions_as_inputs
 from ._guess_shapes import by_shapes, max_correlation
 from ._guess_units import Unit, nominal_step, units, unread_clocks
 from ._layout import ONE_AXIS, Column, Layout, Source, Term, layout_toml
@@ -169,11 +169,12 @@ _MAX_CANDIDATES = 3
 _NO_MOTORS = "no column is of a motor; record their set-points, positions or velocities too"
 
 
-def guess_layout(path: str | Path, *, robot: Robot = NECK) -> Guess:
+def guess_layout(path: str | Path, *, robot: Robot = NECK, output: str | None = None) -> Guess:
     """Return a layout for an unknown log: a text, spreadsheet, Parquet, MAT or MCAP file.
 
     Args:
         robot: the neck of the log, for its motors' range.
+        output: of the neck, "pitch" or "roll", that is taken alone; None: both.
 
     Raises:
         FileFormatError: no such file, or no table.
@@ -181,7 +182,7 @@ def guess_layout(path: str | Path, *, robot: Robot = NECK) -> Guess:
     """
     # Damaged logs hold infinities; numpy's warnings about their sums would not help the user.
     with np.errstate(all="ignore"):
-        return _guess(Path(path), robot)
+        return _guess(Path(path), robot if output is None else of_one_output(robot, output))
 
 
 def _guess(path: Path, neck: Robot) -> Guess:

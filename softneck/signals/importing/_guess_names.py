@@ -99,11 +99,16 @@ def one_axis(draft: Draft, candidates: list[Column], neck: Robot) -> Robot:
     there = [name for name in OUTPUTS if name in draft.picks]
     if len(there) != 1 or candidates or draft.quaternion is not None or "inclination" in draft.picks:
         return neck
+    return neck if neck.outputs.names != OUTPUTS else of_one_output(neck, there[0])
+
+
+def of_one_output(neck: Robot, axis: str) -> Robot:
+    """Return the part of a neck in the plane of one of its outputs."""
     weights = neck.weights()
     table = neck.as_dict()
-    table["name"] = f"neck, {there[0]} only"
-    table["outputs"]["names"] = there
-    row = [] if weights is None else weights[OUTPUTS.index(there[0])].tolist()
+    table["name"] = f"neck, {axis} only"
+    table["outputs"]["names"] = [axis]
+    row = [] if weights is None else weights[OUTPUTS.index(axis)].tolist()
     table["directions"] = {"kind": "matrix", "matrix": [row]}
     table.pop("plant", None)
     table.pop("drives", None)

@@ -48,6 +48,11 @@ class RobotGuess:
     doubts: tuple[Doubt, ...] = ()
 
 
+def has_column(path: str | Path, title: str) -> bool:
+    """Return whether a column of a log has this title."""
+    return title in sniff(path, fewest=2).columns
+
+
 def is_of_another_robot(path: str | Path) -> bool:
     """Return whether a log names no three motors of a neck, and a robot can be proposed from its titles."""
     try:

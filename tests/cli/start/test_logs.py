@@ -177,6 +177,25 @@ def test_constant_set_points_are_refused_with_the_reason_and_what_to_record(call
     assert not (tmp_path / "p" / "models").exists()
 
 
+@pytest.mark.parametrize("axis", ["pitch", "roll"])
+def test_one_output_of_a_necks_log_without_titles_may_be_taken_alone(
+    call: Call, tmp_path: Path, until: Callable[[str], None], axis: str
+) -> None:
+    until("quality")
+    bare_with_rates(tmp_path / "log.csv")
+    said = call("start", "log.csv", "-o", "p", "--yes", "--json", "--output", axis)
+    assert said.code == 0, said.err
+    recording = read_recording(tmp_path / "p" / "recordings" / "log.csv")
+    row = ("pitch", "roll").index(axis)
+    assert recording.robot.outputs.names == (axis,)
+    # To the eight digits of the file.
+    np.testing.assert_allclose(recording.outputs[:, 0], NECK.outputs[: len(recording), row], atol=1e-6)
+    weights, of_neck = recording.robot.weights(), Robot.preset().weights()
+    assert weights is not None
+    assert of_neck is not None
+    np.testing.assert_array_equal(weights, of_neck[row : row + 1])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "says"),
