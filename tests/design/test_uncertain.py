@@ -11,8 +11,9 @@ import pytest
 
 from softneck.core import DataError, SettingsError
 from softneck.design import makeweight, uncertain_plant
+from softneck.design.plants._uncertain import UncertainAxis
 from softneck.design.robust._weights import to_continuous, to_discrete, warp_frequency
-from softneck.estimation import LinearNeck
+from softneck.estimation import AxisPlant, LinearNeck
 from softneck.robot import Robot
 
 from ..oracles.bake_off import bake_off_neck, bake_off_plant, bake_off_samples
@@ -175,3 +176,17 @@ def test_a_family_of_outputs_of_any_name_has_its_samples() -> None:
     plant = uncertain_plant(Slides())
     assert plant.names == ("x",)
     assert [round(item.static_gain, 12) for item in plant.axis("x").samples] == [1.0, 1.0, 2.0]
+
+
+def test_axes_are_the_same_only_where_every_plant_is() -> None:
+    """One synthesis then does for both: another delay, numerator, denominator or number of samples is another axis."""
+
+    def axis(*numbers: tuple[float, float, int]) -> UncertainAxis:
+        plants = [AxisPlant(np.array([b]), np.array([1.0, a]), delay, TS) for b, a, delay in numbers]
+        return UncertainAxis(plants[0], tuple(plants))
+
+    one = axis((0.1, -0.9, 3), (0.2, -0.9, 3))
+    assert one.same_as(axis((0.1, -0.9, 3), (0.2, -0.9, 3)))
+    for other in (((0.1, -0.9, 4), (0.2, -0.9, 3)), ((0.1, -0.9, 3), (0.3, -0.9, 3)), ((0.1, -0.9, 3), (0.2, -0.8, 3)),
+                  ((0.1, -0.9, 3),), ((0.2, -0.9, 3), (0.1, -0.9, 3))):  # fmt: skip
+        assert not one.same_as(axis(*other))

@@ -13,7 +13,9 @@ from softneck.design import FopiSettings, PiSettings, mu_upper
 from softneck.design.robust._mu import two_scalars
 from softneck.estimation import LinearNeck
 from softneck.identification.models._linear_systems import remove_unreachable_states
-from softneck.verification._linear import LinearLaw, frequency_grid, margins, radii
+from softneck.loop import BlockPart
+from softneck.verification import linear_plant
+from softneck.verification._linear import LinearLaw, frequency_grid, inverse, margins, radii
 from softneck.verification._plants import (
     AxisBox,
     Plants,
@@ -275,3 +277,31 @@ def test_numbers_make_plants_between_samples() -> None:
     # Between samples the held input makes 3 % of difference; over the whole sample none.
     np.testing.assert_allclose(np.diff(np.angle(G)), -0.01, rtol=0.03)
     assert np.angle(G[2] / G[0]) == pytest.approx(-0.02, rel=1e-9)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_the_inverse_of_small_matrices_is_theirs(size: int) -> None:
+    rng = np.random.default_rng(size)
+    M = rng.standard_normal((50, size, size)) + 1j * rng.standard_normal((50, size, size))
+    unit = np.broadcast_to(np.eye(size), M.shape)
+    # Rounding, times a condition number of less than 1e3.
+    np.testing.assert_allclose(inverse(M) @ M, unit, rtol=0, atol=1e-12)
+
+
+def test_measured_outputs_have_noise_of_the_stated_size_and_none_at_zero() -> None:
+    """Whatever the seed, 0 among them; the true outputs have none."""
+    values = {
+        "numerator": [[0.0, 0.1], [0.0, 0.2]],
+        "denominator": [[1.0, -0.9], [1.0, -0.8]],
+        "delay": [0, 0],
+        "cross": [0.0, 0.0],
+    }
+    part = BlockPart(linear_plant(**values, sample_time=TS))
+    for std in (0.0, 0.01):
+        for seed in (0.0, 5.0):
+            part.start(0.0, {"noise_std": std, "noise_seed": seed})
+            rows = np.array([part.step(k * TS, np.zeros(5)).copy() for k in range(2000)])
+            assert not rows[:, :2].any()
+            for axis in (2, 3):
+                # The deviation of 2,000 draws is known to 1.6 %; three of that.
+                assert np.std(rows[:, axis]) == pytest.approx(std, rel=0.05, abs=0.0)
