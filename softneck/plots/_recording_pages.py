@@ -72,7 +72,7 @@ def _doubts_section(
     findings = list(dict.fromkeys(findings))
     if not doubts and not problems:
         findings.append(("ok", "every guess is at least 90 % sure."))
-    method = "Left: columns as logged, by row. Right: channels of the recording over time, in the same colours."
+    method = "First: columns as logged, by row. Then: channels of the recording over time, in the same colours."
     title = "Doubts" if doubts or problems else "Columns and channels"
     return Section(title, findings=findings, charts=charts, method=[method] if charts else [])
 
@@ -91,7 +91,7 @@ def _mapping(frame: pd.DataFrame, layout: Layout, recording: Recording | None) -
         made = _span(recording.channels[name] / to_si(unit)[0], unit) if there and recording is not None else ""
         how = ("inverted" if source.sign < 0 else "") + (" integrated" if source.integrate else "")
         rows.append([name, _source_text(source), made, how.strip()])
-    head = ["channel", "from", "in the recording", ""]
+    head = ["channel", "from", "in the recording", "changed"]
     return Section("Mapping", text=text, tables=[Table("Channels", head, rows, text=2)])
 
 
@@ -118,7 +118,8 @@ def _sources(layout: Layout) -> dict[str, Source]:
 
 def _source_text(source: Source) -> str:
     terms = [f"{t.column}" if t.factor == 1.0 else f"{t.factor:.4g} x {t.column}" for t in source.terms]
-    return f"{' + '.join(terms)} [{source.unit}]"
+    said = " + ".join(terms)
+    return said if said.endswith(f"[{source.unit}]") else f"{said} [{source.unit}]"
 
 
 def _column(frame: pd.DataFrame, name: str | int) -> Vector:

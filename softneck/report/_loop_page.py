@@ -91,7 +91,10 @@ def _title(metric: str) -> str:
     """Return a metric in words: "settling time of pitch (pitch.settling_s)"."""
     part, _, name = metric.rpartition(".")
     known = any(f"{name}_".startswith(f"{key}_") for key in METRICS)
-    return f"{metric_of(metric).title} of {part} ({metric})" if known else metric
+    if not known:
+        return metric
+    title = metric_of(metric).title
+    return f"{title}{'' if title.endswith(part) else f' of {part}'} ({metric})"
 
 
 def _value(row: Mapping[str, Any]) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ from softneck.signals import Recording, assess_quality, doubts_in, import_log, r
 from softneck.verification import certificate_values, metric_words
 
 from ._decisions import model_values, project_decision
-from ._study_page import study_sections
+from ._study_page import kept_runs, study_sections
 from ._validation_page import drawable
 
 # Folders that do not belong to a project, like those whose name begins with a dot.
@@ -260,7 +261,7 @@ def project_page(project: Project, *, place: Path | None = None, progress: Progr
     if place is not None and sections and (links := _links(project.folder, place)):
         sections[0] = replace(sections[0], html=links)
     if project.problems:
-        rows = [[name, " ".join(text.split())[:300]] for name, text in project.problems.items()]
+        rows = [[name, shorten(text, 300, placeholder=" ...")] for name, text in project.problems.items()]
         table = Table("Files that could not be read or run", ["file", "why"], rows, text=2)
         sections.append(Section("Problems", tables=[table]))
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
@@ -313,6 +314,7 @@ def project_verdict(project: Project) -> tuple[str, bool | None]:
     parts = [f"{held} of {len(loops)} loops keep their limits"] if loops else []
     if project.certificates:
         parts.append(f"{certified} of {len(project.certificates)} certificates hold")
+    parts += [f"study {name}: {kept_runs(runs)}" for name, (_, runs) in project.studies.items() if len(runs)]
     if project.problems:
         parts.append(f"{len(project.problems)} file(s) could not be read or run")
     unsure = "".join(f" Not sure of {what}: {_shorten(doubts)}." for what, doubts in _doubts(project).items())
@@ -366,7 +368,7 @@ def _models(project: Project, progress: Progress) -> Section:
     # Baselines depend only on the judged rows and take longer than a model, so models with the same rows share them.
     baselines: dict[str, dict[bytes, Any]] = {data: {} for data, _ in judged_on}
     for number, (name, model) in enumerate(project.models.items()):
-        summary = "; ".join(_lines(model)[:2])[:200]
+        summary = shorten("; ".join(_lines(model)[:2]), 200, placeholder=" ...")
         texts.append([name, getattr(model, "kind", type(model).__name__), summary])
         for count, (data, (recording, _)) in enumerate(judged_on):
             progress((number + count / len(judged_on)) / len(project.models), f"{name} on {data}")
@@ -450,7 +452,9 @@ def _fmus(project: Project) -> Section:
     rows = []
     for name, model in project.fmus.items():
         counts = [str(sum(v.causality == c for v in model.modelVariables)) for c in ("input", "output", "parameter")]
-        rows.append([name, f"FMI {model.fmiVersion}", " ".join((model.description or "").split())[:120], *counts])
+        rows.append(
+            [name, f"FMI {model.fmiVersion}", shorten(model.description or "", 120, placeholder=" ..."), *counts]
+        )
     head = ["FMU", "version", "description", "inputs", "outputs", "parameters"]
     return Section("FMUs", tables=[Table("FMUs", head, rows, text=3)])
 

@@ -48,13 +48,18 @@ def study_sections(description: Mapping[str, Any], runs: pd.DataFrame) -> list[S
 
 def study_verdict(description: Mapping[str, Any], runs: pd.DataFrame) -> str:
     """Return a sentence on the runs within their limits and on the best run."""
-    failed, held = sum(failures(runs)), runs["holds"].dropna().tolist()
-    objectives = list(description["objectives"])
-    said = f"{sum(map(bool, held))} of {len(held)} runs keep all limits" if held else f"{len(runs)} runs, no limits"
+    failed, objectives = sum(failures(runs)), list(description["objectives"])
+    said = kept_runs(runs)
     if failed < len(runs):
         best = rank(runs, objectives).iloc[0]
         said += f"; the best, run {best['run']}, has {objectives[0]} {cell(best[objectives[0]])}"
     return said + (f"; {failed} failed with an error." if failed else ".")
+
+
+def kept_runs(runs: pd.DataFrame) -> str:
+    """Return how many runs keep all limits, in words."""
+    held = runs["holds"].dropna().tolist()
+    return f"{sum(map(bool, held))} of {len(held)} runs keep all limits" if held else f"{len(runs)} runs, no limits"
 
 
 def study_rows(

@@ -304,7 +304,10 @@ def _steps(found: Tuned, items: Sequence[Candidate]) -> Chart:
             curves.append(Curve(time, np.full(time.size, size), "reference", GREY, "dashed"))
         curves.append(Curve(time, y, _label(found, item), colour, style, 2.0 if item is found.best else 1.0))
     outputs = found.task.robot.outputs
-    where = "with the heaviest payload" if found.task.own else "of the nominal plant"
+    asked = found.task.asked.certificate.sim["payloads_kg"]
+    heaviest = max((kg for plant in found.own for kg in plant.payloads(asked)), default=0.0)
+    where = "of the simulation model" if found.task.own else "of the nominal plant"
+    where = f"with the heaviest payload, {heaviest:g} kg" if heaviest > 0.0 else where
     panel = Panel(curves, f"{outputs.names[0]} [{outputs.display_unit}]")
     return Chart(f"Steps {where}: the best, and others on the front", [panel], row_height=4.0)
 

@@ -59,7 +59,7 @@ def certificate_decision(one: Values, *, tuner: str | None = None) -> str:
     if one["holds"]:
         undecided = one["undecided"]
         holds = f"{count - len(undecided)} of {count}" if undecided else f"all {count}"
-        rest = f"; {len(undecided)} {'does' if len(undecided) == 1 else 'do'} not decide" if undecided else ""
+        rest = f"; {_undecided_words(undecided)}" if undecided else ""
         # Slack is known of plants with tensions alone, and other robots have no tendons.
         if any(metric.startswith("sim.") and metric != "sim.slack_s" for metric in undecided):
             way = "verify it over a simulation model of this robot too, or over a family with draws"
@@ -78,6 +78,11 @@ def certificate_decision(one: Values, *, tuner: str | None = None) -> str:
         f"Do not run {name} yet: {len(one['failed'])} of {count} requirements fail: {failing}{more}. "
         f"Next: {way}, or record another motion and start with both logs{'; ' + trade if trade else ''}."
     )
+
+
+def _undecided_words(metrics: Sequence[str]) -> str:
+    named = ", ".join(map(metric_words, metrics[:2])) + (f" and {len(metrics) - 2} more" if len(metrics) > 2 else "")
+    return f"{len(metrics)} {'does' if len(metrics) == 1 else 'do'} not decide ({named})"
 
 
 def _requirement(row: Values) -> str:

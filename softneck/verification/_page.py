@@ -236,7 +236,8 @@ def verification_decision(contents: Mapping[str, Any], certificate: str) -> str:
     """Return the decision of `verify` from its JSON; `certificate` is the name of the file."""
     said = certificate_decision(certificate_values(certificate or "its certificate", contents))
     plants, loops = contents["plants"]["count"], contents["virtual_neck_loops"]
-    return f"{said} Judged against {plants} plants and in {loops} simulated loops."
+    drawn = "".join(f" Of its draws: {part['statement']}." for part in contents["draws"])
+    return f"{said} Judged against {plants} linear plants and in {loops} simulated loops.{drawn}"
 
 
 def _requirements_section(found: Verification, certificate: str, stepped: Chart) -> Section:
@@ -257,18 +258,21 @@ def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]
     bounds = Table("Bounds", ["plants", "axis", "mu, bound"], mu, text=2)
     charts = frequency_charts(part, found.evidence.frequency, found.necks[0].gain_unit)
     return [
-        Section(f"Frequency responses{title}", tables=[_margin_table(part)], charts=charts),
+        Section(
+            f"Frequency responses{title}", tables=[_margin_table(part, drawn=bool(found.evidence.drawn))], charts=charts
+        ),
         Section(f"Structured singular value{title}", tables=[bounds], charts=mu_charts(part)),
     ]
 
 
-def _margin_table(part: LinearEvidence) -> Table:
+def _margin_table(part: LinearEvidence, *, drawn: bool) -> Table:
     rows = []
     for name, values in part.margins.items():
         finite = values[np.isfinite(values)]
         middle = float(np.median(finite)) if finite.size else math.inf
         rows.append([name, *(cell(float(v)) for v in (values[0], middle, values.min(), values.max()))])
-    return Table("Margins over all plants tried", ["margin", "nominal", "median", "least", "largest"], rows)
+    title = f"Margins over all linear plants{'; those of the draws decide, above' if drawn else ''}"
+    return Table(title, ["margin", "nominal", "median", "least", "largest"], rows)
 
 
 def _spread(found: Verification, group: str) -> Table:
