@@ -6,7 +6,7 @@ import math
 import time as clock
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import TypeGuard
 
@@ -401,13 +401,22 @@ def _reference_table(loop: Loop, step: float, rows: int) -> Matrix | None:
         return None
     function: Callable[[float], tuple[float, ...]] = loop.reference  # pyright: ignore[reportAssignmentType]
     table = np.ones((rows, len(reference_ports(loop.robot))))
-    for k in range(rows):
-        table[k, :-1] = function(k * step)
+    # Of a search and its certificate most loops have the same few references.
+    table[:, :-1] = (_kept_samples if getattr(function, "repeats", False) else _samples)(function, step, rows)
     bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
     if bad.size:
         k = int(bad[0])
         raise DataError(f"the reference is {table[k, :-1].tolist()} at t = {k * step:g} s; it must be finite.")
     return table
+
+
+def _samples(function: Callable[[float], tuple[float, ...]], step: float, rows: int) -> list[tuple[float, ...]]:
+    return [function(k * step) for k in range(rows)]
+
+
+@lru_cache(maxsize=64)
+def _kept_samples(function: Callable[[float], tuple[float, ...]], step: float, rows: int) -> Matrix:
+    return np.array(_samples(function, step, rows))
 
 
 def _columns(wiring: Wiring) -> dict[str, int]:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -174,6 +174,7 @@ class _Together:
 
     reference: Reference
     cocontraction: float
+    repeats: ClassVar[bool] = True  # equal ones have equal samples: `run_loop` keeps them
 
     def __call__(self, time: float, /) -> tuple[float, ...]:
         return (*self.reference(time)[:-1], self.cocontraction)

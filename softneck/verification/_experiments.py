@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -328,6 +328,7 @@ class _Kicked:
     kick: tuple[float, ...]
     slower: float = 1.0
     together: float = 0.0
+    repeats: ClassVar[bool] = True  # equal ones have equal samples: `run_loop` keeps them
 
     def __call__(self, time: float) -> tuple[float, ...]:
         led = smooth_rise(time, self.slower * LEAD_IN_S)

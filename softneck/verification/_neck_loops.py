@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -298,6 +298,7 @@ class AroundMiddle:
     outputs: tuple[float, ...]
     cocontraction: float
     lead: float
+    repeats: ClassVar[bool] = True  # equal ones have equal samples: `run_loop` keeps them
 
     @classmethod
     def of(cls, reference: Reference, controller: Block, asked: Requirements) -> Reference:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 
-from softneck.core import DataError, SettingsError
+from softneck.core import DataError, SettingsError, Vector
 from softneck.loop import Loop, StepReference, run_loop
 from softneck.runtime import Port
 
@@ -241,3 +241,33 @@ def test_wrong_loop_settings_are_refused(setting: dict[str, object], message: st
     fields = {"plant": lag_plant(), "controller": p_controller(), "reference": STEP, "duration": 1.0, **setting}
     with pytest.raises(SettingsError, match=message):
         Loop(**fields)
+
+
+@dataclass(frozen=True)
+class Counted:
+    """A ramp that counts the samples that it gave; equal ones have one size."""
+
+    size: float
+    repeats: bool
+    calls: list[float] = field(default_factory=list, compare=False)
+
+    def __call__(self, time: float, /) -> tuple[float, ...]:
+        self.calls.append(time)
+        return self.size * time, -self.size, 0.0
+
+
+def test_samples_are_kept_of_references_that_repeat_and_of_no_others() -> None:
+    def run(reference: Counted, duration: float = 0.4) -> Vector:
+        loop = Loop(plant=lag_plant(), controller=p_controller(), reference=reference, duration=duration)
+        return run_loop(loop)["pitch_reference"]
+
+    once, again, other, plain = Counted(0.2, True), Counted(0.2, True), Counted(0.3, True), Counted(0.2, False)
+    expected = run(plain)
+    assert len(plain.calls) == 20
+    assert (run(once) == expected).all()
+    assert (run(again) == expected).all()
+    assert not again.calls
+    assert (run(other) == [0.3 * (k * 0.02) for k in range(20)]).all()  # the same product
+    assert run(again, 0.6).size == 30  # another length is no part of the kept one
+    assert run(plain).size == 20
+    assert len(plain.calls) == 40
