@@ -38,6 +38,7 @@ from softneck.verification._steps import Steps
 from softneck.verification._structured import structured_singular_value
 from softneck.verification._verify import unsupported_reason
 
+from ..data import ROOT
 from .necks import PAPER, QUICK, TS, family, linear_neck, pi
 
 MODEL = Continuous(a=np.array([PAPER[1]]), b=np.array([PAPER[0] * PAPER[1]]), delay=float(PAPER[2]))
@@ -366,3 +367,17 @@ def test_an_fmu_stands_as_much_as_the_plant_that_it_is_made_of(tmp_path: Path, m
     # The same runtime inside, to the last bits of outputs that pass as text nowhere.
     assert swings[0] == pytest.approx(swings[1], rel=1e-9)
     assert swings[1][1] > 0.0
+
+
+def test_plants_are_presets_neck_files_or_what_was_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file in the folder that is called like a preset is the file."""
+    monkeypatch.chdir(tmp_path)
+    Path("my.toml").write_text('preset = "lab"\nbending_stiffness = 0.8\n', encoding="utf-8")
+    saved = ROOT / "tests" / "golden" / "rls.npz"
+    found = named_plants(["my.toml", str(saved), "paper"])
+    assert list(found) == ["my.toml", "rls.npz", "paper"]
+    assert found["my.toml"] == replace(NeckParameters.preset("lab"), bending_stiffness=0.8)
+    assert found["paper"] == NeckParameters.paper()
+    assert found["rls.npz"].kind == "rls"
+    Path("paper").write_bytes(saved.read_bytes())
+    assert named_plants(["paper"])["paper"].kind == "rls"

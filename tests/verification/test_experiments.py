@@ -16,10 +16,13 @@ from softneck.runtime import Block
 from softneck.verification import linear_plant
 from softneck.verification._experiments import (
     _SMALL_RAD,
+    LEAD_IN_S,
+    REST_S,
     Crossing,
     Experiment,
     LoopUnderTest,
     _first_crossing,
+    _Kicked,
     _oscillation,
     _scan_group,
     crossing_values,
@@ -253,3 +256,13 @@ def test_each_channel_is_late_louder_and_disturbed_by_its_own_numbers() -> None:
     for before, after in pairwise(moved):
         assert after[0] == pytest.approx(0.9 * before[0], rel=1e-12)
         assert after[1] == 0.0
+
+
+def test_an_experiment_leads_to_its_posture_waits_and_kicks() -> None:
+    """Half of the posture at half the time of the lead, all of it after, the kick once it has come to rest."""
+    posture, kick, slower = (0.2, -0.1), (0.05, -0.02), 2.0
+    reference = _Kicked(posture, kick, slower=slower, together=0.6)
+    for time_, there, on in ((0.0, 0.0, 0.0), (0.5 * LEAD_IN_S, 0.5, 0.0), (LEAD_IN_S, 1.0, 0.0),
+                             (0.999 * REST_S, 1.0, 0.0), (REST_S, 1.0, 1.0), (50.0, 1.0, 1.0)):  # fmt: skip
+        expected = [there * p + on * k for p, k in zip(posture, kick, strict=True)]
+        assert reference(slower * time_) == pytest.approx((*expected, there * 0.6), abs=1e-15)
