@@ -35,6 +35,7 @@ from ._identify import choose_kind as choose_kind
 from ._identify import fit_and_validate as fit_and_validate
 from ._identify import with_fit as with_fit
 from .models._arrays import payloads as payloads
+from .models._arrays import trained_range as trained_range
 from .models._arrays import without_validity as without_validity
 from .models._directions import bandwidth_of as bandwidth_of
 from .models._fitting import known_rows as known_rows

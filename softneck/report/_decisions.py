@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from softneck.core import percent
+from softneck.core import percent, to_si
+from softneck.identification import trained_range
 from softneck.verification import certificate_decision
 
 # The least simulation fits [%] with their words: `design` refuses models below 30, `identify auto` warns below 70.
@@ -114,10 +115,16 @@ def _last(one: Values) -> Values:
 
 
 def model_values(file: str, model: Any) -> dict[str, Any]:
-    """Return the JSON values of a model in a project: file, kind, and its simulation fit on the rows held out."""
+    """Return the JSON values of a model in a project.
+
+    File, kind, its simulation fit on the rows held out, and the range of the set-points that it was trained on.
+    """
     findings = getattr(model, "findings", {})
-    fit = findings.get("hold_out", {}).get("fit", {})
-    return {"file": file, "kind": getattr(model, "kind", ""), "fit": dict(fit), "chosen": "chosen" in findings}
+    fit, trained = findings.get("hold_out", {}).get("fit", {}), trained_range(findings)
+    unit = "" if trained is None else model.robot.motors.unit
+    ends = None if trained is None else [float(end / to_si(unit)[0]) for end in (trained[0].min(), trained[1].max())]
+    return {"file": file, "kind": getattr(model, "kind", ""), "fit": dict(fit), "chosen": "chosen" in findings,
+            "trained_set_points": ends, "unit": unit}  # fmt: skip
 
 
 def project_decision(models: Sequence[Values], certificates: Sequence[Values], *, tuner: str | None) -> str:
@@ -132,6 +139,9 @@ def project_decision(models: Sequence[Values], certificates: Sequence[Values], *
         said.append(
             f"Use {best['file']} ({best['kind']}): on rows it has not seen it simulates {list_fits(best['fit'])}."
         )
+        if ends := best.get("trained_set_points"):
+            low, high = (f"{end:.3g}" for end in ends)
+            said.append(f"It was trained on set-points from {low} to {high} {best['unit']}: do not trust it outside.")
     verified = sorted(
         (one for one in certificates if one["of"] == "verify"), key=lambda one: (one["holds"], one["file"])
     )

@@ -64,7 +64,7 @@ def certificate_decision(one: Values, *, tuner: str | None = None) -> str:
         if any(metric.startswith("sim.") and metric != "sim.slack_s" for metric in undecided):
             way = "verify it over a simulation model of this robot too, or over a family with draws"
         else:
-            way = "run it on drives with that certificate"
+            way = "run it on drives with that certificate (`softneck drives --help`)"
         more = f", or {trade}" if trade else ""
         return f"{name} holds {holds} requirements of {one['file']}{rest}. Next: {way}{more}."
     if not one["failed"]:

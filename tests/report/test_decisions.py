@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,6 +20,7 @@ from softneck.report._decisions import (
     beats,
     fit_word,
     list_fits,
+    model_values,
     project_decision,
     validation_decision,
 )
@@ -155,15 +157,17 @@ def test_a_project_decides_on_model_controller_and_next_step() -> None:
     fit = {"x": 91.0, "y": 85.0}
     models = [
         {"file": "a.npz", "kind": "nn", "fit": {"x": 99.0, "y": 99.0}, "chosen": False},
-        {"file": "auto.npz", "kind": "play", "fit": fit, "chosen": True},
+        {"file": "auto.npz", "kind": "play", "fit": fit, "chosen": True, "trained_set_points": [13.6, 146.04],
+         "unit": "kPa"},
         {"file": "none.npz", "kind": "oe", "fit": {}, "chosen": False},
-    ]
+    ]  # fmt: skip
     held = [certificate_values("best.certificate.json", certificate(0))]
     said = project_decision(models, held, tuner="tune/tuner.html")
     assert said == (
         "Use auto.npz (play): on rows it has not seen it simulates x 91.0 % (very good), y 85.0 % (good). "
+        "It was trained on set-points from 13.6 to 146 kPa: do not trust it outside. "
         "tune/best.npz (hinf) holds all 1 requirements of best.certificate.json. Next: run it on drives with that "
-        "certificate, or open tune/tuner.html to trade speed for caution."
+        "certificate (`softneck drives --help`), or open tune/tuner.html to trade speed for caution."
     )
     # What does not decide is not held; loops over no model of the robot are not enough for drives.
     for metric, way in (("sim.rise_s", "Next: verify it over a simulation model"), ("sim.slack_s", "Next: run"),
@@ -191,6 +195,15 @@ def test_a_project_decides_on_model_controller_and_next_step() -> None:
     unknown = certificate_values("z.json", {**certificate(3), "requirements": certificate(3)["requirements"][2:3]})
     assert "sim.of_another_version 2, required at most 1." in project_decision([], [unknown], tuner=None)
     assert project_decision([], [], tuner=None) == ""
+
+
+def test_a_model_tells_the_set_points_it_was_trained_on_in_the_unit_of_its_robot() -> None:
+    robot: Any = SimpleNamespace(motors=SimpleNamespace(unit="kPa"))
+    trained = {"min": [13_600.0, 20_000.0], "max": [90_000.0, 146_000.0]}
+    model = SimpleNamespace(kind="play", robot=robot, findings={"set_points_rad": trained})
+    found = model_values("m.npz", model)
+    assert (found["trained_set_points"], found["unit"]) == ([13.6, 146.0], "kPa")
+    assert model_values("m.npz", SimpleNamespace(kind="play"))["trained_set_points"] is None
 
 
 def test_a_project_s_page_opens_with_the_decision_and_links_the_tuner(tmp_path: Path) -> None:

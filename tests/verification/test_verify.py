@@ -200,7 +200,9 @@ def test_the_command_writes_a_certificate_that_deploys(files: dict[str, Path], c
     call = ["verify", str(files["controller"]), str(files["family"]), "--requirements", str(files["asked"]), "--json"]
     assert run([*call, "-o", str(certificate)]) == 0
     printed = json.loads(capsys.readouterr().out)
+    decision = printed.pop("decision")
     assert printed == json.loads(certificate.read_text(encoding="utf-8"))
+    assert decision == verification_decision(printed, certificate.name)
     assert set(read_certificate(certificate).files) == {"controller", "plant 1", "requirements"}
     check_certificate(certificate, [files["controller"], files["family"]])
     pi(delay=2).save(files["controller"], force=True)
