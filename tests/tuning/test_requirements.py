@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +18,14 @@ from softneck.core import FileFormatError, SettingsError
 from softneck.estimation import LinearNeck
 from softneck.loop.default_limits import NECK_RISE_S
 from softneck.report._tune import _toml_table
-from softneck.robot import Robot
-from softneck.tuning._requirements import check_feasibility, make_tune_requirements, read_tune_requirements
+from softneck.robot import TIME_CONSTANT, Robot
+from softneck.tuning._requirements import (
+    USUAL_RISE,
+    check_feasibility,
+    default_rise,
+    make_tune_requirements,
+    read_tune_requirements,
+)
 from softneck.verification import make_requirements, read_requirements
 from softneck.verification._metrics import Scale
 
@@ -255,3 +262,30 @@ def test_settling_is_judged_by_the_sensor_up_to_the_noise_that_fits_the_band() -
         found = make_tune_requirements({"sim": {"size_deg": size}})
         asked = replace(found, track={**found.track, "noise_deg": noise})
         assert asked.shows_settling(part) == shown
+
+
+def test_the_default_rise_is_that_of_the_slowest_axis() -> None:
+    """Worse axes and plants never ask for a shorter rise, a quick robot is asked for the usual one, settling bounds."""
+    asked = make_tune_requirements(
+        {"sim": {"size_deg": 15.0, "duration_s": 60.0}, "require": {"sim.settling_s": {"max": 50.0}}}
+    )
+
+    def axis(pole: float, delay: int = DELAY) -> control.TransferFunction:
+        a = math.exp(-pole * TS)
+        return control.TransferFunction([GAIN * (1 - a)], [1.0, -a, *[0.0] * delay], TS)
+
+    def rise(pitch: float, roll: float, *, delay: int = DELAY, more: Sequence[float] = ()) -> float:
+        plants = [LinearNeck(pitch=axis(pitch), roll=axis(roll, delay))]
+        plants += [LinearNeck(pitch=axis(pole), roll=axis(pole)) for pole in more]
+        found = default_rise(plants, asked)
+        assert found is not None
+        return found
+
+    slow, quick = rise(1.0, 1.0), rise(POLE, POLE)
+    assert slow > 1.4 * quick
+    assert rise(1.0, POLE) == rise(POLE, 1.0) == slow
+    assert rise(POLE, POLE, delay=60) > quick
+    assert rise(POLE, POLE, more=(POLE,)) == quick
+    assert rise(40.0, 40.0) >= USUAL_RISE * TIME_CONSTANT
+    short = make_tune_requirements({"sim": {"size_deg": 15.0}, "require": {"sim.settling_s": {"max": 0.3}}})
+    assert default_rise([LinearNeck(pitch=axis(1.0), roll=axis(1.0))], short) == short.robot_limit("sim.settling_s")
