@@ -223,6 +223,9 @@ def _verdicts(found: Tuned) -> list[tuple[Requirement, float | None, bool | None
     for item in found.task.asked.bounds:
         if item.metric.startswith("track."):
             value = found.best.metrics.get(item.metric)
+            if value is None and not found.task.own:
+                rows.append((item, None, None, "not computed: no simulation model of the robot was given"))
+                continue
             why = "not computed: the budget ended before its loops were simulated" if value is None else ""
             rows.append((item, value, value is not None and item.holds(value), why))
     return rows

@@ -57,11 +57,11 @@ def certificate_decision(one: Values, *, tuner: str | None = None) -> str:
     name = f"{name} ({one['kind']})" if one["kind"] else name
     trade = "" if tuner is None else f"open {tuner} to trade speed for caution"
     if one["holds"]:
-        undecided = one["undecided"]
-        holds = f"{count - len(undecided)} of {count}" if undecided else f"all {count}"
+        undecided, held = one["undecided"], count - len(one["undecided"]) - len(one["failed"])
+        holds = f"{held} of {count}" if held < count else f"all {count}"
         rest = f"; {_undecided_words(undecided)}" if undecided else ""
         # Slack is known of plants with tensions alone, and other robots have no tendons.
-        if any(metric.startswith("sim.") and metric != "sim.slack_s" for metric in undecided):
+        if any(metric.startswith(("sim.", "track.")) and metric != "sim.slack_s" for metric in undecided):
             way = "verify it over a simulation model of this robot too, or over a family with draws"
         else:
             way = "run it on drives with that certificate (`softneck drives --help`)"
