@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,7 +26,7 @@ from softneck.drives.master._limiter import Limiter
 from softneck.drives.master._master import Master, Measurement
 from softneck.drives.master._settings import LimitSettings, WatchSettings
 from softneck.drives.master._watches import Patience, Watches, timing
-from softneck.drives.running import _bus_loop, _certified, _preflight, _stop
+from softneck.drives.running import _bus_loop, _certified, _pilot, _preflight, _stop
 from softneck.drives.running._bus_loop import RunEnd, Session
 from softneck.drives.running._certified import SAME, _as_strict, require_same_again
 from softneck.drives.running._pilot import LoopPilot, SignalLog, SignalPilot, raised_cosine
@@ -259,6 +260,13 @@ def test_a_frame_that_only_a_master_sends_is_told(frame: Frame, told: str) -> No
     assert foreign_master([Frame(0x181, bytes(8)), frame]) == told
 
 
+def test_another_master_is_named_and_nothing_else_is_asked_of_the_drives(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_preflight, "listen", lambda *_: "a SYNC")
+    link: Any = SimpleNamespace()  # it can send nothing
+    (row,) = _preflight.preflight(link, FILE).table()["rows"]
+    assert (row["check"], row["found"], row["holds"]) == ("second master", "a SYNC", False)
+
+
 def test_set_points_of_others_are_those_to_our_nodes() -> None:
     assert set_points_of_others([Frame(0x203, bytes(6))], [1, 2, 3]) == "set-points to node 3"
     for frame in (Frame(0x204, bytes(6)), Frame(0x303, bytes(6)), Frame(0x203, bytes(6), error=True)):
@@ -329,6 +337,17 @@ def test_a_sample_is_logged_once_with_the_set_points_that_were_sent_to_its_end()
         log(0.005 * cycle, (), (), None, master)  # pyright: ignore[reportArgumentType]
     assert [row["motor_setpoint_1"] for row in logged] == [0.1 * 3, 0.1 * 7]
     assert log.rows == 2
+
+
+def test_rows_are_kept_in_the_folder_of_the_session_and_without_one_where_temporary_files_are(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    places: list[Path | None] = []
+    monkeypatch.setattr(_pilot, "Rows", lambda _columns, _motors, folder: places.append(folder))
+    told: Any = SimpleNamespace(file=SimpleNamespace(moves=NECK), log=None, folder=tmp_path, link=None)
+    SignalLog(3)
+    SignalLog(3, session=told)
+    assert places == [None, tmp_path]
 
 
 # -- certificates -----------------------------------------------------------------------------------------------------

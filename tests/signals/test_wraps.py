@@ -44,10 +44,20 @@ def test_missed_samples_stay_missed_and_each_run_comes_near_the_first() -> None:
         np.repeat([0.0, TURN, 0.0, TURN], 100),
         np.where(np.arange(400) % 100 == 50, 0.0, 0.6 * TURN + 0.01 * np.sin(np.arange(400.0))),
         3.0 * TURN * np.sin(np.arange(400.0)),
+        0.05 * np.arange(400.0) % TURN - 0.6 * TURN,
+        0.05 * np.arange(400.0) % TURN - 0.4 * TURN,
         np.full(400, np.nan),
         np.zeros(0),
     ],
-    ids=["held commands", "spikes to zero", "beyond a turn", "nothing", "no rows"],
+    ids=[
+        "held commands",
+        "spikes to zero",
+        "beyond a turn",
+        "below half a turn",
+        "above half a turn",
+        "nothing",
+        "no rows",
+    ],
 )
 def test_other_jumps_are_left_alone(x: np.ndarray) -> None:
     assert count_wraps(x, TURN) == 0
