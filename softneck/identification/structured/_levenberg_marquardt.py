@@ -112,7 +112,7 @@ def _direction(x: Vector, g: Vector, A: Matrix, bounds: Bounds) -> Vector:
     free = ~(((x <= bounds.low) & (g > 0.0)) | ((x >= bounds.high) & (g < 0.0)))
     while True:
         d, i = np.zeros(x.size), np.flatnonzero(free)
-        d[i] = np.linalg.solve(A[np.ix_(i, i)], -g[i])
+        d[i] = np.linalg.solve(A[i[:, None], i], -g[i])
         held = ((x <= bounds.low) & (d < 0.0)) | ((x >= bounds.high) & (d > 0.0))
         if not held.any():
             return d
