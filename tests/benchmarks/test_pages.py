@@ -14,9 +14,12 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from softneck.plots import Section, page
 from softneck.plots._charts import recording_chart, residual_chart, validation_chart
+from softneck.report import write_tuned
 from softneck.signals import Recording
+from softneck.tuning import tune
 
 from ..browser import shown
+from ..data import ROOT
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -77,3 +80,37 @@ def test_zoom_and_redraw(benchmark: BenchmarkFixture, browser: Browser, tmp_path
         print(f"zoom and redraw [ms]: {[round(time) for time in times]}")
         assert max(times) < 1000.0
         assert view.x_range(chart) == whole
+
+
+# Milliseconds from moving a slider of the tuner page to the end of the frame in which all is drawn.
+_MOVE = """async value => {
+  const frame = () => new Promise(done => requestAnimationFrame(() => setTimeout(done, 0)));
+  const node = document.getElementById("speed");
+  await frame();
+  const start = performance.now();
+  node.value = value;
+  node.dispatchEvent(new Event("input"));
+  do await frame(); while (!Bokeh.documents[0].is_idle);
+  return performance.now() - start;
+}"""
+
+
+@pytest.mark.benchmark(group="tuner page")
+def test_move_a_slider_of_the_tuner(benchmark: BenchmarkFixture, browser: Browser, tmp_path: Path) -> None:
+    """Five moves of the slider `speed`, each to the end of the frame in which all is drawn."""
+    plants = {"oe.npz": ROOT / "tests" / "golden" / "oe.npz"}
+    asked = {"sampling": {"plants": 12, "search_generations": 0}, "step": {"duration_s": 2.0}}
+    found = tune({name: str(path) for name, path in plants.items()}, asked, kinds=("pi",), budget=10, workers=0,
+                 folder=tmp_path)  # fmt: skip
+    write_tuned(found, tmp_path, plants)
+    with shown(browser, tmp_path / "tuner.html") as view:
+        view.wait(lambda: view.page.evaluate("typeof tuner !== 'undefined'"))
+
+        rounds: list[list[float]] = []
+
+        def move_all() -> None:
+            rounds.append([view.page.evaluate(_MOVE, value) for value in (0, 100, 25, 75, 50)])
+
+        benchmark.pedantic(move_all, rounds=15)
+        times = np.median(rounds, axis=0)
+        print(f"frames of the tuner page, medians [ms]: {np.round(times, 1)}")
