@@ -81,7 +81,7 @@ def certificate_decision(one: Values, *, tuner: str | None = None) -> str:
 
 
 def _undecided_words(metrics: Sequence[str]) -> str:
-    named = ", ".join(map(metric_words, metrics[:2])) + (f" and {len(metrics) - 2} more" if len(metrics) > 2 else "")
+    named = "; ".join([*map(metric_words, metrics[:2]), *([f"{len(metrics) - 2} more"] if len(metrics) > 2 else [])])
     return f"{len(metrics)} {'does' if len(metrics) == 1 else 'do'} not decide ({named})"
 
 

@@ -179,6 +179,11 @@ def test_a_project_decides_on_model_controller_and_next_step() -> None:
         words = metric_words(metric)
         assert f"holds 1 of 2 requirements of c.json; 1 does not decide ({words})." in said
         assert way in said
+    many = [{"metric": f"sim.{name}", "value": None, "limit": 1.0, "holds": None}
+            for name in ("rise_s", "overshoot_pct", "settling_s")]  # fmt: skip
+    said = project_decision([], [certificate_values("c.json", {**certificate(0), "requirements": many})], tuner=None)
+    assert "holds 0 of 3 requirements of c.json; 3 do not decide (rise time, simulation; overshoot, " in said
+    assert "simulation; 1 more)" in said
     # The certificate that fails decides, wherever it is in the list.
     failed = certificate_values("z.json", certificate(3))
     for both in ([*held, failed], [failed, *held]):
