@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sys
 import tomllib
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -202,14 +202,14 @@ def command(
     propose = named is not None or robot_out is not None
     propose |= layout_file is None and not known_robot and signals.is_of_another_robot(log)
     if propose or (layout_file is None and not _can_guess(whose)):
-        imported, layout, facts = _of_robot(job, whose, robot_out, known=known_robot, propose=propose)
-        proposed = None
+        proposed, imported, facts = _of_robot(job, whose, robot_out, known=known_robot, propose=propose)
+        layout = proposed.layout
     elif layout_file is None:
         proposed, imported, facts = _by_guess(job, whose, alone_output)
         layout = proposed.layout
     else:
         layout, proposed = signals.read_layout(layout_file, robot=whose), None
-        imported = signals.import_log(log, layout)
+        imported = _import(job, layout)
     _finish(job, imported, facts, layout, proposed)
 
 
@@ -243,7 +243,7 @@ def _run_log(log: Path) -> tuple[signals.ImportResult, dict[str, Any]]:
 
 def _finish(
     job: _Job, imported: signals.ImportResult, facts: dict[str, Any], layout: signals.Layout | None = None,
-    proposed: signals.Guess | None = None,
+    proposed: signals.Guess | signals.RobotGuess | None = None,
 ) -> None:  # fmt: skip
     """Resample if required, write all files, and print a summary."""
     imported = _at_sample_time(job, imported)
@@ -268,8 +268,8 @@ def _at_sample_time(job: _Job, imported: signals.ImportResult) -> signals.Import
 
 
 def _preview(
-    job: _Job, layout: signals.Layout, proposed: signals.Guess | None, imported: signals.ImportResult | None,
-    problems: tuple[str, ...] = (),
+    job: _Job, layout: signals.Layout, proposed: signals.Guess | signals.RobotGuess | None,
+    imported: signals.ImportResult | None, problems: tuple[str, ...] = (),
 ) -> str:  # fmt: skip
     """Return the page that shows the log's columns and their channels."""
     return plots.import_page(
@@ -279,8 +279,28 @@ def _preview(
         recording=None if imported is None else imported.recording,
         doubts=() if proposed is None else proposed.doubts,
         lines=[*(() if proposed is None else proposed.lines), *(() if imported is None else imported.notes)],
-        problems=(*problems, *(() if proposed is None else proposed.missing)),
+        problems=(*problems, *(proposed.missing if isinstance(proposed, signals.Guess) else ())),
     )
+
+
+@contextmanager
+def _page_of_refusal(job: _Job, doubts: tuple[signals.Doubt, ...] = ()) -> Iterator[None]:
+    """Write the page that was asked for if the log is refused inside: its raw columns, and why."""
+    try:
+        yield
+    except DataError as error:
+        if job.html is not None:
+            frame, columns = signals.describe_columns(job.log, job.named)
+            why = str(error).removeprefix(f"{job.log}: ")
+            page = plots.refused_page(job.log, frame, columns, why, doubts)
+            job.texts = {job.html: (page, job.force)}
+            job.write()
+        raise
+
+
+def _import(job: _Job, layout: signals.Layout, doubts: tuple[signals.Doubt, ...] = ()) -> signals.ImportResult:
+    with _page_of_refusal(job, doubts):
+        return signals.import_log(job.log, layout)
 
 
 def _by_guess(
@@ -329,7 +349,7 @@ def _by_guess(
 
 def _of_robot(
     job: _Job, robot: Robot, robot_out: Path | None, *, known: bool, propose: bool
-) -> tuple[signals.ImportResult, signals.Layout, dict[str, Any]]:
+) -> tuple[signals.RobotGuess, signals.ImportResult, dict[str, Any]]:
     """Import a log by named or recognised columns, or by the titles of `robot`; write the robot that is proposed.
 
     `known`: whether somebody, or the log itself, said that it is of `robot`.
@@ -340,13 +360,14 @@ def _of_robot(
 
     proposal = job.beside(".layout.toml")
     facts: dict[str, Any] = {"layout_file": str(proposal)}
-    if propose:
-        if robot_out is not None:
-            refuse_existing(robot_out, force=job.force)
-        whose = robot if known and job.named is not None else None
-        found = signals.guess_robot(job.log, job.named, robot=whose, sample_time=job.clock)
-    else:
-        found = signals.layout_for(job.log, robot, sample_time=job.clock)
+    if propose and robot_out is not None:
+        refuse_existing(robot_out, force=job.force)
+    with _page_of_refusal(job):
+        if propose:
+            whose = robot if known and job.named is not None else None
+            found = signals.guess_robot(job.log, job.named, robot=whose, sample_time=job.clock)
+        else:
+            found = signals.layout_for(job.log, robot, sample_time=job.clock)
     for line in found.lines:
         note(line)
     facts |= {"reasons": list(found.lines), "doubts": [doubt.as_dict() for doubt in found.doubts]}
@@ -363,8 +384,8 @@ def _of_robot(
         facts["robot_file"] = str(file)
     text = signals.layout_toml(layout, remarks=remarks)
     job.texts[proposal] = (text, job.replace)
-    imported = signals.import_log(job.log, layout)
-    return imported, layout, {**facts, "layout": tomllib.loads(text), "robot": imported.recording.robot.label()}
+    imported = _import(job, layout, found.doubts)
+    return found, imported, {**facts, "layout": tomllib.loads(text), "robot": imported.recording.robot.label()}
 
 
 def _tell(path: Path, imported: signals.ImportResult, more: dict[str, Any], as_json: bool) -> None:

@@ -34,3 +34,4 @@ from ._neck3d import why_not_drawn as why_not_drawn
 from ._page import Script as Script
 from ._page import cell as cell
 from ._recording_pages import import_page as import_page
+from ._recording_pages import refused_page as refused_page

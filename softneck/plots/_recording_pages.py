@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,11 +40,34 @@ def import_page(
     charts = _charts(frame, layout, recording)
     sections = [_doubts_section(doubts, problems, lines, charts[:1]), _mapping(frame, layout, recording)]
     if recording is None:
-        sections.insert(1, Section("Columns of the log", tables=[_columns(frame, layout)]))
+        sections.insert(1, Section("Columns of the log", tables=[_columns(frame, _roles(layout))]))
     if charts[1:]:
         sections.append(Section("Raw columns and channels", charts=charts[1:]))
     if left_out := [line.removeprefix("ignored: ") for line in lines if line.startswith("ignored: ")]:
         sections.append(Section("Left out", text=left_out))
+    return _import_page(log, sections, doubts, problems, recording)
+
+
+def refused_page(
+    log: Path, frame: pd.DataFrame, columns: Mapping[str | int, tuple[str, str]], why: str,
+    doubts: Sequence[Doubt] = (),
+) -> str:  # fmt: skip
+    """Return the HTML page of an import that was refused, of columns each with its unit ("" for none) and role."""
+    roles: dict[str, dict[str | int, str]] = {}
+    for column, (unit, role) in columns.items():
+        if role[-1:].isdigit():
+            roles.setdefault(role.rstrip("0123456789 "), {})[column] = unit
+    panels = [replace(_raw_panel(frame, those), title=role) for role, those in roles.items()]
+    charts = [Chart("Raw columns", panels, x_label="", columns=2, linked=False, row_height=2.6)] if panels else []
+    sections = [Section("Columns of the log", tables=[_columns(frame, columns)], charts=charts,
+                        findings=_findings_of_doubts(doubts))]  # fmt: skip
+    return _import_page(log, sections, doubts, (why,), None)
+
+
+def _import_page(
+    log: Path, sections: Sequence[Section], doubts: Sequence[Doubt], problems: Sequence[str],
+    recording: Recording | None,
+) -> str:  # fmt: skip
     return page(
         f"Import of {log.name}", sections, verdict=_import_verdict(doubts, problems, recording),
         holds=False if problems else None if doubts else True,
@@ -62,19 +86,23 @@ def _doubts_section(
     doubts: Sequence[Doubt], problems: Sequence[str], lines: Sequence[str], charts: Sequence[Chart]
 ) -> Section:
     """Return the doubts and problems for the reader to decide, with the first chart."""
-    findings = [("warning", f"missing: {problem}") for problem in problems]
+    # The verdict, at the top of the page, has the first problem.
+    findings = [("warning", f"missing: {problem}") for problem in problems[1:]]
     findings += [("warning", line.removeprefix("warning: ")) for line in lines if line.startswith("warning: ")]
-    # A list, since a phone shows two columns of a table of five.
-    findings += [
-        ("note", f"{one} ({'or: ' + ', '.join(one.choices) if one.choices else 'if not, edit the layout'})")
-        for one in doubts
-    ]
-    findings = list(dict.fromkeys(findings))
+    findings = list(dict.fromkeys([*findings, *_findings_of_doubts(doubts)]))
     if not doubts and not problems:
         findings.append(("ok", "every guess is at least 90 % sure."))
     method = "First: columns as logged, by row. Then: channels of the recording over time, in the same colours."
     title = "Doubts" if doubts or problems else "Columns and channels"
     return Section(title, findings=findings, charts=charts, method=[method] if charts else [])
+
+
+def _findings_of_doubts(doubts: Sequence[Doubt]) -> list[tuple[str, str]]:
+    # A list, since a phone shows two columns of a table of five.
+    return [
+        ("note", f"{one} ({'or: ' + ', '.join(one.choices) if one.choices else 'if not, edit the layout'})")
+        for one in doubts
+    ]
 
 
 def _mapping(frame: pd.DataFrame, layout: Layout, recording: Recording | None) -> Section:
@@ -95,20 +123,25 @@ def _mapping(frame: pd.DataFrame, layout: Layout, recording: Recording | None) -
     return Section("Mapping", text=text, tables=[Table("Channels", head, rows, text=2)])
 
 
-def _columns(frame: pd.DataFrame, layout: Layout) -> Table:
+def _columns(frame: pd.DataFrame, columns: Mapping[str | int, tuple[str, str]]) -> Table:
     """Return a table of the raw columns: the unit that was read, the range, and what each seems to be."""
-    sources, rows = _sources(layout), []
+    rows = []
     for number, title in enumerate(frame.columns):
-        taken = {
-            name: source for name, source in sources.items()
-            if any(term.column in (title, number) for term in source.terms)
-        }  # fmt: skip
-        values = _column(frame, title)
+        values = _column(frame, number)
         seen = values[np.isfinite(values)]
         ends = [f"{seen.min():.4g}", f"{seen.max():.4g}"] if seen.size else ["no number", ""]
-        unit = ", ".join(dict.fromkeys(source.unit for source in taken.values())) or "-"
-        rows.append([str(title), unit, *ends, ", ".join(taken) or "not recognised"])
+        unit, role = columns.get(number) or columns.get(title) or ("", "not recognised")
+        rows.append([str(title), unit or "-", *ends, role])
     return Table("Columns", ["column", "unit read", "least", "largest", "seems to be"], rows)
+
+
+def _roles(layout: Layout) -> dict[str | int, tuple[str, str]]:
+    """Return the units and the channels of each column that a layout takes."""
+    found: dict[str | int, dict[str, str]] = {}
+    for name, source in _sources(layout).items():
+        for term in source.terms:
+            found.setdefault(term.column, {})[name] = source.unit
+    return {column: (", ".join(dict.fromkeys(those.values())), ", ".join(those)) for column, those in found.items()}
 
 
 def _sources(layout: Layout) -> dict[str, Source]:
@@ -151,23 +184,22 @@ def _charts(frame: pd.DataFrame, layout: Layout, recording: Recording | None) ->
         raw = [name for name in raw if name in sources]
         made = [name for name in (names or [title]) if recording is not None and name in recording.channels]
         if raw or made:
-            panels = [_raw_panel(frame, {name: sources[name] for name in raw})]
+            panels = [_raw_panel(frame, {t.column: sources[name].unit for name in raw for t in sources[name].terms})]
             if recording is not None and made:
                 panels.append(_made_panel(recording, made))
             charts.append(Chart(title.capitalize(), panels, x_label="", columns=2, linked=False, row_height=2.6))
     return [chart for chart in charts if any(panel.curves for panel in chart.panels)]
 
 
-def _raw_panel(frame: pd.DataFrame, sources: dict[str, Source]) -> Panel:
-    columns = dict.fromkeys(term.column for source in sources.values() for term in source.terms)
+def _raw_panel(frame: pd.DataFrame, columns: Mapping[str | int, str]) -> Panel:
+    """Return a panel of columns, each with its unit."""
     every = max(1, len(frame) // _MAX_POINTS)
     rows = np.arange(0, len(frame), every, dtype=np.float64)
     curves = [
         Curve(rows, _column(frame, name)[::every], str(name), ALL_MOTOR_COLOURS[k % len(ALL_MOTOR_COLOURS)], "line")
         for k, name in enumerate(columns)
     ]
-    units = {source.unit for source in sources.values()}
-    return Panel(curves, f"as logged [{'/'.join(sorted(units)) or '?'}]", x_label="row", title="raw")
+    return Panel(curves, f"as logged [{'/'.join(sorted(set(columns.values()))) or '?'}]", x_label="row", title="raw")
 
 
 def _least_spans(recording: Recording) -> dict[str, float]:

@@ -36,7 +36,9 @@ from .importing._layout import doubts_in as doubts_in
 from .importing._log import ImportResult as ImportResult
 from .importing._log import read_log as read_log
 from .importing._robot_guess import NamedColumns as NamedColumns
+from .importing._robot_guess import RobotGuess as RobotGuess
 from .importing._robot_guess import columns_line as columns_line
+from .importing._robot_guess import describe_columns as describe_columns
 from .importing._robot_guess import guess_robot as guess_robot
 from .importing._robot_guess import has_column as has_column
 from .importing._robot_guess import is_of_another_robot as is_of_another_robot

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from softneck.robot import Robot
@@ -231,6 +233,34 @@ def test_a_recording_of_ours_keeps_all_its_channels(call: Call) -> None:
     assert after.robot.hash == before.robot.hash
     for name, values in before.channels.items():
         np.testing.assert_array_equal(after.channels[name], values)
+
+
+@pytest.mark.parametrize(
+    ("missed", "motor", "why"),
+    [(None, "bb", "there is no column `bb`"), ("-999", "b [kPa]", "times as far as all others")],
+)
+def test_a_refused_import_of_named_columns_leaves_the_page_of_raw_columns(
+    call: Call, tmp_path: Path, missed: str | None, motor: str, why: str
+) -> None:
+    (tmp_path / "log.csv").write_text(pneumatic_log())
+    table = pd.read_csv("log.csv", dtype=str)
+    table.loc[100:140, "flexion(deg)"] = missed or table["flexion(deg)"]
+    table.to_csv("log.csv", index=False)
+    named = ("--motor", "a [kPa]", "--motor", motor, "--output", "flexion(deg)")
+    said = call("import", "log.csv", *named, "-o", "rec.csv", "--html", "p.html")
+    assert (said.code, why in said.err.splitlines()[-1]) == (2, True), said.err
+    assert {path.name for path in tmp_path.iterdir()} == {"log.csv", "p.html"}
+    page = Path("p.html").read_text()
+    assert page.count(why) == 1
+    rows = re.findall(r'<td class="text"[^>]*>([^<]+)</td>' + 4 * r"<td[^>]*>([^<]*)</td>", page)
+    table = pd.read_csv("log.csv")
+    assert [row[0] for row in rows] == list(table.columns)
+    for title, unit, least, largest, _ in rows:
+        assert (least, largest) == (f"{table[title].min():.4g}", f"{table[title].max():.4g}")
+        assert (unit == "kPa") == ("[kPa]" in title)
+    seem = {row[0]: row[4] for row in rows}
+    titles = ["t_s", "a [kPa]", "b [kPa]", "flexion(deg)"]
+    assert [seem[title] for title in titles] == ["time", "set-point of motor 1", "set-point of motor 2", "output 1"]
 
 
 @pytest.mark.parametrize(

@@ -225,7 +225,37 @@ def test_the_clock_of_any_robot_is_checked_against_its_title(
     guess = guess_robot(write(tmp_path / "log.csv", columns))
     # Six digits of minutes are written: a step is off by 2 %.
     assert import_log(tmp_path / "log.csv", guess.layout).recording.sample_time == pytest.approx(0.02, rel=1e-3)
-    assert ["clock" in doubt.about for doubt in guess.doubts] == [False, *[True] * doubted]
+    assert [doubt.channels == ("time",) for doubt in guess.doubts] == [False, *[True] * doubted]
+
+
+STEPS = 0.02 + 0.004 * np.random.default_rng(3).uniform(-1.0, 1.0, ROWS)
+
+
+@pytest.mark.parametrize(
+    ("clock", "runs"),
+    [
+        ({"elapsed": TIME}, 1),
+        ({"elapsed": 44_000.0 + TIME / 86_400.0}, 1),
+        ({"elapsed": np.cumsum(STEPS)}, 1),
+        ({"elapsed": np.r_[TIME[:200], TIME[:200]]}, 2),
+        ({"sec": np.floor(TIME), "nanosec": np.round(1e9 * (TIME - np.floor(TIME)))}, 1),
+        ({"dt": STEPS}, 1),
+        ({"time": np.floor(TIME)}, 1),
+    ],
+)
+def test_named_columns_take_the_clock_that_the_guess_finds(tmp_path: Path, clock: dict[str, Vector], runs: int) -> None:
+    path = tmp_path / "log.csv"
+    table = np.column_stack([*clock.values(), A, ONE])
+    # Days of a spreadsheet need all digits.
+    np.savetxt(path, table, delimiter=",", header=",".join([*clock, "p", "answer"]), comments="", fmt="%.17g")
+    guess = guess_robot(path, NamedColumns(("p",), ("answer",)))
+    made = import_log(path, guess.layout).recording
+    # The steps of the uneven clocks have this mean, within 3 standard errors.
+    assert made.sample_time == pytest.approx(0.02, rel=0.02)
+    assert (len(made), len(made.runs())) == (ROWS, runs)
+    assert "--sample-time" not in columns_line(path)
+    with pytest.raises(DataError, match="no column is a time; say its sample time"):
+        guess_robot(write(tmp_path / "none.csv", {"p": A, "answer": ONE}), NamedColumns(("p",), ("answer",)))
 
 
 def test_a_unit_of_another_quantity_than_the_given_robots_is_refused(tmp_path: Path) -> None:

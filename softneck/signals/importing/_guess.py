@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from ..recording._resampling import jitter
 from ._clocks import SampleTime, estimate_sample_time
 from ._draft import SURE, Doubt, Draft, column_label, percent
 from ._guess_names import by_names, drop_or_turn_quaternion, of_one_output, one_axis, use_positions_as_inputs
-from ._guess_shapes import by_shapes, max_correlation
+from ._guess_shapes import by_shapes, max_correlation, pick_clock
 from ._guess_units import Unit, nominal_step, units, unread_clocks
 from ._layout import ONE_AXIS, Column, Layout, Source, Term, layout_toml
 from ._odd_clocks import double_stamps, mean_of_steps, rows_of_stamp
@@ -296,6 +296,23 @@ def _choose_clock(draft: Draft, found: dict[str, Unit], layout: Layout) -> tuple
                      f"not at the {1e3 * nominal:g} ms of the time column")  # fmt: skip
         return replace(layout, estimate=True), lines, doubts
     return layout, lines, doubts
+
+
+def guess_clock(table: SniffResult, taken: Collection[Column]) -> tuple[Layout, list[str], list[Doubt]] | None:
+    """Return the clock of a log of any robot as a layout without channels, with reasons and doubts; None without one.
+
+    `taken`: columns that are motors or outputs.
+    """
+    draft = Draft(replace(table, columns={name: x for name, x in table.columns.items() if name not in taken}))
+    by_names(draft)
+    pick_clock(draft)
+    found = units(draft)
+    layout, lines, doubts = _choose_clock(draft, found, _layout(draft, found, NECK))
+    if layout.time is None and layout.sample_time is None:
+        return None
+    draft.picks = {"time": draft.picks["time"]} if layout.time is not None else {}
+    lines = [*(_line(draft, found, name) for name in draft.picks), *lines]
+    return replace(layout, channels={}, estimate=False), lines, [*doubts_of(draft, found), *doubts]
 
 
 _STEP_TITLES = {"dt", "delta t", "deltat", "ts", "sample time", "time step", "timestep", "step s", "period", "interval"}

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from softneck.core import SoftneckError
+from softneck.core import SoftneckError, spelled_unit
 from softneck.robot import Robot
 
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS, parse_column, redefine
 from ._clocks import axis_rotations, velocity_period
-from ._column_titles import plain
+from ._column_titles import Title, plain
 from ._draft import Draft, Pick, column_label
 from ._guess_shapes import max_correlation
 from ._layout import Column, Quaternion, Term
@@ -182,9 +182,13 @@ def _time_and_run(draft: Draft, by_role: dict[str, list[tuple[int, Column]]]) ->
 
 def _seconds_and_nanoseconds(draft: Draft) -> None:
     """Take both columns of a ROS 2 stamp, which are a time only together."""
+
+    def of(title: Title) -> str:
+        return "" if spelled_unit(title.family) else title.family  # `sec` beside `nanosec` has no other name
+
     for column, title in draft.titles.items():
         if title.role == "time" and title.unit == "ns":
-            whole = [c for c, t in draft.titles.items() if (t.role, t.family, t.unit) == ("time", title.family, "s")]
+            whole = [c for c, t in draft.titles.items() if (t.role, of(t), t.unit) == ("time", of(title), "s")]
             if len(whole) == 1 and "time" not in draft.picks:
                 terms = (Term(whole[0]), Term(column, 1e-9))
                 draft.picks["time"] = Pick(terms, "both parts of a stamp of ROS 2", "s")

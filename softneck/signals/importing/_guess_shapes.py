@@ -246,7 +246,7 @@ def _confidence(agreement: float) -> float:
 
 def by_shapes(draft: Draft) -> None:
     """Choose the columns that are still missing by their data."""
-    _clock(draft)
+    pick_clock(draft)
     _rates(draft)
     _set_points(draft)
     _motors_without_rates(draft)
@@ -264,7 +264,8 @@ def _pick_output(draft: Draft, axis: str, column: str | int, r: float) -> None:
     draft.pick(axis, column, why + inverted, sign=-1.0 if r < 0 else 1.0, confidence=_confidence(r))
 
 
-def _clock(draft: Draft) -> None:
+def pick_clock(draft: Draft) -> None:
+    """Choose the column of time by its data if no title names it."""
     if "time" in draft.picks:
         return
     free = {name: draft.moving[name] for name in draft.free()}

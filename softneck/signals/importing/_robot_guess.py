@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,12 +18,16 @@ from softneck.robot import Robot
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, SET_POINTS, parse_column, si_unit
 from ._column_titles import ambiguity
 from ._draft import SURE, Doubt, Draft
+from ._guess import guess_clock
 from ._guess_names import by_names
 from ._guess_units import Unit, clock_unit, unread_clocks
 from ._layout import Column, Layout, Source, Term
 from ._roles import NOTHING_NEW, Roles, find_roles, may_be_motor, names_a_place
 from ._table_format import SniffResult, sniff
 from .formats._text import DATE
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _OF_A_NECK = ("pitch", "roll", "inclination", "orientation")
 _UNIT = re.compile(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$")
@@ -91,11 +97,15 @@ def guess_robot(
     """
     table = sniff(path, fewest=2)
     given = _given(path, table, named or NamedColumns())
-    roles = find_roles(table, given)
+    roles, clock = find_roles(table, given), None
+    if sample_time is None:
+        clock = guess_clock(table, [column for columns in given.values() for column in columns])
+        if clock is not None and clock[0].time is not None:
+            roles = find_roles(table, {**given, "time": [term.column for term in clock[0].time.terms]})
     if not roles.motors or not roles.outputs:
         what = "motor" if not roles.motors else "output"
         raise DataError(f"{path}: no column was recognised as {what}. Name them: {columns_line(path, table, roles)}")
-    if roles.time is None and sample_time is None:
+    if roles.time is None and sample_time is None and clock is None:
         raise DataError(f"{path}: no column is a time; say its sample time: --sample-time S.")
     whole = bool(given["motors"] and given["outputs"])
     if robot is None:
@@ -107,11 +117,15 @@ def guess_robot(
         *zip(robot.outputs.names, roles.outputs, strict=True),
     ]
     channels += zip(robot.motor_positions, roles.positions, strict=False)  # of no motor or of all
-    layout, clock = _layout(path, table, robot, channels, roles, sample_time)
+    layout, of_clock = _layout(path, table, robot, channels, roles, sample_time)
+    if clock is not None:
+        layout = replace(clock[0], channels=layout.channels, run=roles.run, robot=robot)
+        of_clock = clock[2]
     taken = [f"motors: {_list(roles.motors)}{f': {roles.why}' if roles.why else ''}"]
     taken += [f"measured positions: {_list(roles.positions)}"] if roles.positions else []
     taken += [f"outputs: {_list(roles.outputs)}"]
-    doubts = [*_unit_doubts(table, channels), *clock]
+    taken += [] if clock is None else clock[1]
+    doubts = [*_unit_doubts(table, channels), *of_clock]
     if not whole:
         why = f"{_list(roles.motors)} move, {_list(roles.outputs)} are outputs"
         doubts.insert(0, Doubt("robot", robot.set_points[:1], why, 0.8, "by titles"))
@@ -131,6 +145,26 @@ def _unit_doubts(table: SniffResult, channels: Sequence[tuple[str, Column]]) -> 
     return list(found.values())
 
 
+def describe_columns(
+    path: str | Path, named: NamedColumns | None = None
+) -> tuple[pd.DataFrame, dict[Column, tuple[str, str]]]:
+    """Return a log's table, and of each column the unit of its title ("" for none) and what it seems to be.
+
+    `named`: columns that the user named; a role with a name that is not there is found without names.
+    """
+    table, given = sniff(path, fewest=2), dict[str, list[Column]]()
+    for role, titles in asdict(named or NamedColumns()).items():
+        with suppress(DataError):
+            given[role] = [column for title in titles for column in _columns(path, table, title)]
+    roles = find_roles(table, given)
+    said: dict[Column, str] = {**dict.fromkeys(table.words, "words"), **roles.left_out}
+    for what, columns in (("set-point of motor", roles.motors), ("position of motor", roles.positions),
+                          ("output", roles.outputs)):  # fmt: skip
+        said |= {column: f"{what} {k}" for k, column in enumerate(columns, start=1)}
+    said |= {column: what for column, what in ((roles.time, "time"), (roles.run, "run number")) if column is not None}
+    return table.frame, {column: (table.title(column).unit or "", what) for column, what in said.items()}
+
+
 def columns_line(path: str | Path, table: SniffResult | None = None, roles: Roles | None = None) -> str:
     """Return the command that names a log's columns, with the best candidates filled in."""
     table = sniff(path, fewest=2) if table is None else table
@@ -146,7 +180,8 @@ def columns_line(path: str | Path, table: SniffResult | None = None, roles: Role
         ("--motor", motors or ["COL"]), ("--position", roles.positions), ("--output", outputs or ["COL"])
     ):  # fmt: skip
         words += [word for text in _ranges(columns) for word in (option, text)]
-    words += [] if roles.time is not None else ["--sample-time", "S"]
+    clock = roles.time is not None or guess_clock(table, [*motors, *outputs]) is not None
+    words += [] if clock else ["--sample-time", "S"]
     return f"`{shlex.join(words)} -o rec.csv`; for its limits see `softneck robot new`"
 
 

@@ -139,12 +139,12 @@ class _Words:
 
 
 def find_roles(table: SniffResult, named: Mapping[str, Sequence[Column]]) -> Roles:
-    """Return the roles of a log's columns; `named` holds the motors, positions and outputs that the user named."""
+    """Return the roles of a log's columns; `named` holds the motors, positions, outputs and time that are known."""
     found = Roles()
     given = {column for columns in named.values() for column in columns}
     said = {column: _read(table, column) for column in table.columns}
     rest = [column for column in table.columns if column not in given]
-    found.time, found.run = _clock(table, rest), _run(rest)
+    found.time, found.run = next(iter(named["time"])) if "time" in named else _clock(table, rest), _run(rest)
     rest = [column for column in rest if column not in (found.time, found.run)]
     rows = {column: table.columns[column][:_MOST_ROWS] for column in table.columns}
     for column in [one for one in rest if not _moves(rows[one])]:
