@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 
 from softneck.core import CheckFailedError, SettingsError
 from softneck.drives import default_drives
-from softneck.drives.bus._link import VirtualLink
+from softneck.drives.bus._link import BusError, VirtualLink
 from softneck.drives.bus._objects import CSP, GUARDING_OBJECTS, HOMED_MARK, Write
 from softneck.drives.bus._sdo import SdoError
 from softneck.drives.logs._result import CycleTimes
@@ -25,6 +26,7 @@ from softneck.drives.master._gate import BAD, DROPOUT, FROZEN, Gate
 from softneck.drives.master._limiter import Limiter
 from softneck.drives.master._master import Master, Measurement
 from softneck.drives.master._settings import LimitSettings, WatchSettings
+from softneck.drives.master._supervisor import ACTIVE
 from softneck.drives.master._watches import Patience, Watches, timing
 from softneck.drives.running import _bus_loop, _certified, _pilot, _preflight, _stop
 from softneck.drives.running._bus_loop import RunEnd, Session
@@ -34,6 +36,7 @@ from softneck.drives.running._preflight import PreflightCheck, Report, foreign_m
 from softneck.drives.running._stop import require_reset, require_stopped
 from softneck.drives.running._timing import Ask
 from softneck.loop import Loop
+from softneck.robot import Robot
 from softneck.signals import NECK
 
 from .test_any_robot import Ports
@@ -225,6 +228,121 @@ def test_a_negative_number_that_reads_back_as_its_bits_is_kept() -> None:
         assert rows.rows[-1].holds is holds
 
 
+def test_a_drive_that_takes_its_mode_later_is_not_asked_for_it_again() -> None:
+    """All other objects of its mode are written all the same."""
+    objects = Told(refused={0x6060: 0x08000022})
+    rows = checked(objects)
+    assert all(row.holds for row in rows.values())
+    assert {0x60C2, 0x60FF, 0x607D, 0x100C} <= {index for index, _, _ in objects.written}
+
+
+class Wire:
+    """A link of a pre-flight: frames go out, and nothing comes by itself."""
+
+    def __init__(self, problem: str = "") -> None:
+        self.now, self.problem, self.sent = 0.0, problem, list[Frame]()
+
+    def send(self, frames: Any) -> None:
+        self.sent += frames
+
+    def receive(self, timeout: float) -> list[Frame]:
+        self.now += timeout
+        return []
+
+
+def preflown(
+    monkeypatch: pytest.MonkeyPatch, changes: dict[int, Told] | None = None,
+    serials: dict[int, list[int]] | None = None,     **how: Any,
+) -> tuple[Report, Wire, dict[int, Told]]:  # fmt: skip
+    """Return the report on three good drives but for `changes`, by node."""
+    drives = {node: (changes or {}).get(node) or Told() for node in FILE.nodes}
+    for node, drive in drives.items():
+        drive.node = node
+    found = {node: [node] for node in FILE.nodes} | (serials or {})
+    monkeypatch.setattr(_preflight, "listen", lambda *_: "")
+    monkeypatch.setattr(_preflight, "devices_at", lambda *_: found)
+    monkeypatch.setattr(_preflight, "Objects", lambda _, node: drives[node])
+    wire = Wire(how.pop("problem", ""))
+    return _preflight.preflight(wire, how.pop("file", FILE), **how), wire, drives
+
+
+def told_of(report: Report, name: str) -> dict[int, bool]:
+    return {row.node: row.holds for row in report.rows if row.name == name}
+
+
+def test_each_drive_is_silenced_and_checked_and_what_fails_at_one_hides_no_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    report, wire, _ = preflown(monkeypatch, override=("homed",))
+    assert (report.holds, report.guarding, report.overridden) == (True, "life", ("homed",))
+    assert told_of(report, "node number") == dict.fromkeys(FILE.nodes, True)
+    assert told_of(report, "second master") == {0: True}
+    assert told_of(report, "mapping") == dict.fromkeys(FILE.nodes, True)
+    assert "homed" not in {row.name for row in report.rows}
+    # Pre-operational to each (CiA 301, 7.2.8.2.1.3).
+    assert wire.sent == [Frame(0x000, bytes([0x80, node])) for node in FILE.nodes]
+    for silent in FILE.nodes:
+        for drive, row in ((Told(silent=0x1000), "present"), (Told({(0x1000, 0): None}), "objects")):
+            report, _, _ = preflown(monkeypatch, {silent: drive})
+            assert [(item.node, item.name) for item in report.rows if not item.holds] == [(silent, row)]
+            assert all(told_of(report, "mapping").get(node) for node in FILE.nodes if node != silent)
+    with pytest.raises(BusError, match="the bus takes no frames: off"):
+        preflown(monkeypatch, problem="off.")
+
+
+def test_two_devices_with_one_number_end_the_pre_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    report, _, drives = preflown(monkeypatch, serials={2: [5, 6]})
+    assert told_of(report, "node number") == {node: node != 2 for node in FILE.nodes}
+    assert all(not drive.written for drive in drives.values())
+    assert {row.name for row in report.rows} == {"second master", "node number"}
+
+
+def test_all_drives_are_guarded_as_the_first_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, *others = FILE.nodes
+    both = dict.fromkeys(GUARDING_OBJECTS, 0)
+    by_heartbeat = {key: None if key[0] in (0x100C, 0x100D) else 0 for key in GUARDING_OBJECTS}
+    report, _, drives = preflown(monkeypatch, {first: Told(by_heartbeat), **{node: Told(both) for node in others}})
+    assert (report.holds, report.guarding) == (True, "heartbeat")
+    assert all((0x1017, 0) in {item[:2] for item in drive.written} for drive in drives.values())
+    # One that can do the other kind alone is refused.
+    report, _, _ = preflown(monkeypatch, {first: Told(both)})
+    assert told_of(report, "guarding") == {first: True, **dict.fromkeys(others, False)}
+    # Where the first has none, the next decides.
+    none = dict.fromkeys(GUARDING_OBJECTS, None)
+    report, _, _ = preflown(monkeypatch, {first: Told(none)})
+    assert report.guarding == "life"
+    assert told_of(report, "guarding") == {node: node != first for node in FILE.nodes}
+
+
+@pytest.mark.parametrize("mark", [HOMED_MARK, HOMED_MARK + 1, 0, -HOMED_MARK])
+def test_a_zero_is_known_by_its_mark_alone(mark: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    report, _, _ = preflown(monkeypatch, {2: Told({(0x607C, 0): mark})}, homed=True)
+    assert told_of(report, "homed") == {node: node != 2 or mark == HOMED_MARK for node in FILE.nodes}
+    assert {row.found for row in report.rows if row.name == "homed" and not row.holds} <= {"no"}
+
+
+@pytest.mark.parametrize(("kind", "node"), [("can", 77), ("serial", 0)])
+def test_a_sensor_on_the_bus_is_started_and_told_by_its_number(
+    kind: str, node: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Any] = []
+    monkeypatch.setattr(_preflight, "look_at", lambda *args: seen.append(args) or Tilt(0.1, -0.2))
+    file, sensor = replace(FILE, sensor_kind=kind, sensor_node=77), SimpleNamespace(problem="it smokes")
+    report, wire, _ = preflown(monkeypatch, file=file, sensor=sensor)
+    assert [(row.node, row.holds, row.found) for row in report.rows if row.name == "inclinometer"] == [
+        (node, True, "pitch 5.73, roll -11.46 deg")
+    ]
+    # Operational (CiA 301, 7.2.8.2.1.1), and two seconds to say something.
+    assert (wire.sent[len(FILE.nodes) :] == [Frame(0x000, bytes([0x01, 77]))]) is (kind == "can")
+    assert seen == [(sensor, wire, _preflight.LOOK)]
+    monkeypatch.setattr(_preflight, "look_at", lambda *_: None)
+    report, _, _ = preflown(monkeypatch, file=file, sensor=sensor)
+    assert [row.advice for row in report.rows if row.name == "inclinometer"] == ["it smokes"]
+    report, _, _ = preflown(monkeypatch, file=file, sensor=SimpleNamespace(problem=""))
+    advice = "`node` of [sensor]" if kind == "can" else "plugged in"
+    assert all(advice in row.advice for row in report.rows if row.name == "inclinometer")
+
+
 # -- the report -------------------------------------------------------------------------------------------------------
 
 
@@ -407,6 +525,14 @@ def test_a_requirement_is_as_strict_up_to_the_default_itself(bound: str) -> None
     assert _as_strict(row | {"bound": "below"}, bound, 2.0) is (bound == "max")
 
 
+def _cart() -> Robot:
+    return Robot.from_dict({
+        "name": "cart", "time_constant_s": 2.0, "directions": {"kind": "matrix", "matrix": [[1.0]]},
+        "motors": {"names": ["drive"], "unit": "V", "nominal": 3.0},
+        "outputs": {"names": ["place"], "unit": "mm", "nominal": 4.0},
+    })  # fmt: skip
+
+
 def test_a_certificate_of_another_robot_is_refused() -> None:
     def of(contents: dict[str, Any]) -> Any:
         return SimpleNamespace(path="c.json", contents=contents)
@@ -416,6 +542,75 @@ def test_a_certificate_of_another_robot_is_refused() -> None:
     for robot in ({"hash": "0" * 64}, {"hash": None}, {}):
         with pytest.raises(CheckFailedError, match="is of the robot with the hash"):
             _certified._require_robot(of({"robot": robot}), NECK)
+
+
+def test_arming_asks_for_the_limits_that_verify_stretched_to_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scale in the certificate counts, 1 where it says none; a metric that the robot has not is not asked for."""
+    asked: list[Any] = []
+    monkeypatch.setattr(
+        _certified, "_why_not_shown", lambda _, metric, defaults: asked.append((metric, defaults)) or ""
+    )
+
+    def limits(robot: Robot, **contents: Any) -> dict[str, float]:
+        asked.clear()
+        _certified._require_minimum(SimpleNamespace(path="c", contents=contents, rows=[]), robot)  # pyright: ignore[reportArgumentType]
+        return {metric: defaults[metric].limit for metric, defaults in asked}
+
+    plain = limits(NECK)
+    assert set(plain) == set(_certified.ARMING)
+    for scale, time, size in (({}, 1.0, 1.0), ({"time": 3.0}, 3.0, 1.0), ({"size": 5.0}, 1.0, 5.0)):
+        found = limits(NECK, scale=scale)
+        assert found["axes.delay_margin_ms"] == pytest.approx(time * plain["axes.delay_margin_ms"])
+        assert found["step.load_rms_deg"] == pytest.approx(size * plain["step.load_rms_deg"])
+        assert found["axes.gain_margin"] == plain["axes.gain_margin"]
+    cart = _cart()
+    assert set(limits(cart)) == {metric.replace("_deg", "_mm") for metric in plain} - {"sim.slack_s"}
+
+
+def test_draws_must_stand_for_nine_of_ten_plants(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_certified, "_why_not_shown", lambda *_: "")
+    for content, enough in ((0.9, True), (0.95, True), (math.nextafter(0.9, 0.0), False), (math.nan, False)):
+        found: Any = SimpleNamespace(path="c", contents={"draws": [
+            {"failed": [], "content": 0.99}, {"failed": [], "content": content}]}, rows=[])  # fmt: skip
+        if enough:
+            _certified._require_minimum(found, NECK)
+            continue
+        with pytest.raises(CheckFailedError, match=r"its draws stand for .* at least 90 % are needed"):
+            _certified._require_minimum(found, NECK)
+
+
+def test_a_run_again_takes_its_first_row_and_then_as_many_as_there_is_time_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, steps = [100.0], list[int]()
+
+    class Run:
+        def __init__(self, length: Any) -> None:
+            self.length = length
+            steps.clear()
+
+        def __enter__(self) -> Run:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+        def advance(self, rows: int) -> bool:
+            # Compilation takes long, and does not count.
+            clock[0] += 0.5 * rows if steps else 60.0
+            steps.append(rows)
+            return sum(steps) >= self.length
+
+        def result(self) -> int:
+            return sum(steps)
+
+    monkeypatch.setattr(_certified, "LoopRun", Run)
+    monkeypatch.setattr(_certified.time, "perf_counter", lambda: clock[0])
+    for length, seconds, expected in (
+        (1000, 12.0, [1, 10, 10, 10]),
+        (1, 12.0, [1]),
+        (1000, 0.0, [1]),
+        (11, 12.0, [1, 10]),
+    ):
+        assert _certified._run_for(length, seconds) == sum(expected)  # pyright: ignore
+        assert steps == expected
 
 
 # -- the loop on the bus ----------------------------------------------------------------------------------------------
@@ -647,7 +842,8 @@ def test_whatever_ends_a_run_the_drives_are_switched_off(
         "_switch_off": lambda *args: calls.append(args[-1]) or "failed",
     }.items():  # fmt: skip
         monkeypatch.setattr(_bus_loop, name, value)
-    monkeypatch.setattr(_bus_loop.time, "sleep", lambda _: None)
+    waited: list[float] = []
+    monkeypatch.setattr(_bus_loop.time, "sleep", waited.append)
     sent: list[Any] = []
     link: Any = SimpleNamespace(now=4.0, send=sent.extend, receive=lambda _: [], tap=None)
     sensor: Any = object()
@@ -666,6 +862,7 @@ def test_whatever_ends_a_run_the_drives_are_switched_off(
     end = run()
     assert calls[0] == {"override": ("homed",), "homed": True, "sensor": session.sensor}
     assert calls[1:] == ["required", "ready", *["stop"] * bool(failure), ("sign",) if fed else ()]
+    assert waited == [0.1]
     assert end.error == (failure or "failed")
     assert begun == [master]
     assert "start" in master.told
@@ -674,6 +871,35 @@ def test_whatever_ends_a_run_the_drives_are_switched_off(
     blind = Session(file=FILE, link=link)
     with pytest.raises(SettingsError, match="need an inclinometer"):
         _bus_loop._run_session(blind, Pilot(), 0.02, 9.0, None, told)
+
+
+def test_the_end_of_a_run_in_numbers() -> None:
+    master: Any = Led()
+    master.supervisor.phase = Phase.DONE
+    found = RunEnd(master, CycleTimes(0.02), 0.7).table()
+    # Seven cycles of 20 ms in 0.7 s.
+    assert found["real_time_factor"] == pytest.approx(0.2)
+    assert (found["cycles"], found["cycle_s"], found["phase"], found["fault"]) == (7, 0.02, "done", None)
+    assert math.isfinite(RunEnd(master, CycleTimes(0.02), 0.0).table()["real_time_factor"])
+
+
+@pytest.mark.parametrize("phase", list(Phase))
+def test_tensions_of_a_run_are_those_while_the_drives_had_power(phase: Phase, monkeypatch: pytest.MonkeyPatch) -> None:
+    master: Any = Led()
+    master.start, master.supervisor.phase = (lambda: None), phase
+    for name, value in {
+        "preflight": lambda *_, **__: SimpleNamespace(require=lambda: None, guarding="life", late_modes=[]),
+        "Master": lambda *_: master, "_switch_off": lambda *_: None,
+        "_in_real_time": lambda session, *_: [watch(0.0, (), (), None, master) for watch in session.watches],
+    }.items():  # fmt: skip
+        monkeypatch.setattr(_bus_loop, name, value)
+    monkeypatch.setattr(_bus_loop.time, "sleep", lambda _: None)
+    link: Any = SimpleNamespace(now=4.0, send=lambda _: None, receive=lambda _: [], tap=None)
+    session = Session(file=FILE, link=link, sensor=object(), operator=SimpleNamespace(terminated=True))  # pyright: ignore[reportArgumentType]
+    notifier: Any = SimpleNamespace(ready=lambda: None)
+    end = _bus_loop._run_session(session, Pilot(), 0.02, 9.0, None, notifier)
+    assert end.tensions == ((1.0, 2.0, 3.0) if phase in ACTIVE else (0.0, 0.0, 0.0))
+    assert end.terminated
 
 
 # -- pilots -----------------------------------------------------------------------------------------------------------
@@ -715,10 +941,48 @@ def test_a_measurement_goes_to_the_plant_s_outputs_each_to_its_own() -> None:
 def test_a_loop_that_drives_cannot_run_is_refused() -> None:
     with pytest.raises(SettingsError, match="sequential"):
         LoopPilot(_loop(order="jacobi"))
-    slow = Ports("controller", ["pitch"], [f"motor_setpoint_{j}" for j in (1, 2, 3)])
-    slow.sample_time = 0.04
-    with pytest.raises(SettingsError, match=r"need one sample time; it has .*0\.04 s"):
-        LoopPilot(_loop(controller=slow))
+    for time in (0.04, 0.02 * 1.001, 0.02 * 0.999):
+        slow = Ports("controller", ["pitch"], [f"motor_setpoint_{j}" for j in (1, 2, 3)])
+        slow.sample_time = time
+        with pytest.raises(SettingsError, match=rf"need one sample time; it has .*{time:g} s"):
+            LoopPilot(_loop(controller=slow))
+    names = [f"motor_setpoint_{j}" for j in (1, 2, 3)]
+    between = Ports("part", names[:1], names)
+    settings = {"controller": Ports("controller", ["pitch"], names[:1]), "others": {"limiter": between},
+                "connections": {f"plant.{name}": f"limiter.{name}" for name in names}}  # fmt: skip
+    with pytest.raises(SettingsError, match=r"does not give three motor set-points: motor_setpoint_1\."):
+        LoopPilot(_loop(**settings))
+
+
+def test_a_pilot_is_warmed_by_one_step_at_rest_and_starts_all_parts_but_the_plant(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    started: list[Any] = []
+    monkeypatch.setattr(
+        Ports, "start", lambda part, *args: started.append((part.role, *args)) or np.zeros(len(part.outputs))
+    )
+    asked: list[Measurement] = []
+    pilot = LoopPilot(_loop(controller_parameters={"gain": 2.0}))
+    monkeypatch.setattr(pilot, "step", asked.append)
+    pilot.warm()
+    assert started == [("controller", 0.0, {"gain": 2.0})]
+    (rest,) = asked
+    assert (rest.index, rest.fresh, rest.positions, rest.tilt.values) == (0, True, (0.0, 0.0, 0.0), (0.0, 0.0))
+    closed: list[str] = []
+    monkeypatch.setattr(Loop, "close", lambda _: closed.append("closed"))
+    pilot.close()
+    assert closed == ["closed"]
+    assert (pilot.slot("controller", "nothing"), pilot.slot("nobody", "pitch")) == (None, None)
+
+
+def test_what_is_measured_beats_what_the_plant_would_be() -> None:
+    """An output that a plant has both as it is and as measured is written to both; a rate to its own."""
+    pilot = LoopPilot(_loop(plant=_plant("pitch", "pitch_measured", "roll", "roll_rate_measured", "motor_position_2")))
+    outputs = np.full(5, 9.0)
+    pilot._measure(Measurement(0, Tilt(0.1, -0.2, 0.3, 0.4), True, (1.0, 2.0, 3.0)), outputs)
+    assert outputs.tolist() == [0.1, 0.1, -0.2, 0.4, 2.0]
+    pilot._measure(Measurement(0, Tilt(math.inf, -math.inf, 0.3, math.nan), True, (1.0, 2.0, 3.0)), outputs)
+    assert outputs.tolist() == [0.0, 0.0, 0.0, 0.0, 2.0]
 
 
 # -- the master -------------------------------------------------------------------------------------------------------

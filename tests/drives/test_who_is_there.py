@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from softneck.cli._main import run
 from softneck.core import CheckFailedError
 from softneck.drives import DrivesFile, default_drives, preflight, reset, scan, simulated_neck
-from softneck.drives.bus._link import VirtualLink, reason
-from softneck.drives.bus._sdo import Objects
+from softneck.drives.bus._link import BusError, VirtualLink, reason
+from softneck.drives.bus._sdo import Objects, SdoError
 from softneck.drives.commissioning._jog import jog_pilot
 from softneck.drives.master import Frame
+from softneck.drives.running import _preflight
 from softneck.drives.running._bus_loop import Session, run_session
+from softneck.drives.running._preflight import devices_at, listen, several_devices
 from softneck.drives.running._stop import wait
 from softneck.drives.simulated._profiles import PROFILES, Profile, ds402
 from softneck.drives.simulated._quirks import DriveQuirks
@@ -138,6 +141,163 @@ def test_a_full_queue_is_told_with_its_cause() -> None:
     assert reason(OSError(105, "No buffer space available")).startswith(
         "No buffer space available. Nobody acknowledges"
     )
+
+
+# -- the requests of a scan, one by one -------------------------------------------------------------------------------
+
+
+class Line:
+    """A bus where time passes while somebody waits; `answer` gives (delay [s], frame) for each frame that is sent."""
+
+    def __init__(self, answer: Callable[[Frame], Iterable[tuple[float, Frame]]] = lambda _: ()) -> None:
+        self.now, self.problem, self.answer = 0.0, "", answer
+        self.sent: list[tuple[float, Frame]] = []
+        self.coming: list[tuple[float, Frame]] = []
+
+    def send(self, frames: Iterable[Frame]) -> None:
+        for frame in frames:
+            self.sent.append((self.now, frame))
+            self.coming += [(self.now + delay, answer) for delay, answer in self.answer(frame)]
+
+    def receive(self, timeout: float) -> list[Frame]:
+        assert timeout >= 0.0
+        until = self.now + timeout
+        first = min((at for at, _ in self.coming), default=until)
+        self.now = min(max(self.now, first), until)
+        frames = [frame for at, frame in self.coming if at <= self.now]
+        self.coming = [item for item in self.coming if item[0] > self.now]
+        return frames
+
+
+def told(node: int, value: int = 0x20192, index: int = 0x1000, sub: int = 0, command: int = 0x43) -> Frame:
+    """Return an answer to the request of an object (CiA 301, 7.2.4.3.6)."""
+    return Frame(0x580 + node, bytes([command, index & 0xFF, index >> 8, sub]) + value.to_bytes(4, "little"))
+
+
+def scanned(line: Line, monkeypatch: pytest.MonkeyPatch, **how: int) -> list[Any]:
+    monkeypatch.setattr(_preflight, "_identity", lambda _link, objects, kind: (objects.node, kind))
+    return scan(line, **how)
+
+
+@pytest.mark.parametrize(
+    ("rate", "pause"), [(1_000_000, 2e-3), (250_000, 2e-3), (125_000, 3 * 135 / 125e3), (20_000, 3 * 135 / 20e3)]
+)
+def test_a_scan_asks_each_number_once_as_fast_as_an_absent_device_allows(
+    rate: int, pause: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second of listening, three frames of 135 bits or 2 ms for each of 126 numbers, 0.2 s for the last answers."""
+    line = Line()
+    assert scanned(line, monkeypatch, bit_rate=rate) == []
+    assert [frame for _, frame in line.sent] == [
+        Frame(0x600 + node, bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0])) for node in range(1, 127)
+    ]
+    assert [at for at, _ in line.sent] == pytest.approx([1.0 + k * pause for k in range(126)])
+    assert line.now == pytest.approx(1.0 + 126 * pause + 0.2)
+
+
+def test_a_scan_waits_for_an_answer_no_longer_than_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(lambda frame: [(0.0, told(frame.identifier - 0x600))])
+    assert scanned(line, monkeypatch) == [(node, 0x20192) for node in range(1, 127)]
+    assert {at for at, _ in line.sent} == {1.0}
+    # A bus that frames no longer leave is told at the first request, or at the end.
+    line = Line(lambda _: setattr(line, "problem", "x.") or [])
+    with pytest.raises(BusError, match=r"^the bus takes no frames: x\. Nothing was moved\.$"):
+        scan(line)
+    assert len(line.sent) == 1
+    line = Line()
+    line.receive = lambda timeout: (
+        setattr(line, "problem", "late." * (len(line.sent) == 126)) or Line.receive(line, timeout)
+    )
+    with pytest.raises(BusError, match=r"late\."):
+        scan(line)
+
+
+@pytest.mark.parametrize(
+    ("answer", "kind"),
+    [
+        (told(7), 0x20192), (told(7, 0x06020000, command=0x80), 0x06020000), (told(7, index=0x1001), None),
+        (told(7, index=0x1100), None), (told(7, sub=1), None), (told(7)._replace(data=told(7).data[:7]), None),
+        (told(7)._replace(error=True), None), (told(0), None), (told(127), None), (told(-0x80), None),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize(("delay", "late"), [(0.0, False), (0.15, False), (0.5, True)])
+def test_a_scan_takes_the_answers_to_its_own_request_alone(
+    answer: Frame, kind: int | None, delay: float, late: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for asked in (7, 126):
+        line = Line(lambda frame, asked=asked: [(delay, answer)] * (frame.identifier == 0x600 + asked))
+        # 119 requests of 2 ms are still to come after that to node 7.
+        missed = kind is None or (late and asked == 126) or delay > 0.4
+        assert scanned(line, monkeypatch) == ([] if missed else [(7, kind)])
+
+
+def test_devices_are_told_apart_by_their_serial_numbers_within_their_time() -> None:
+    def answer(frame: Frame) -> list[tuple[float, Frame]]:
+        assert frame.data == bytes([0x40, 0x18, 0x10, 4, 0, 0, 0, 0])
+        node = frame.identifier - 0x600
+        serial = [(after, told(node, 10 * node + k, 0x1018, 4)) for k, after in enumerate((0.0, 0.19, 0.21))]
+        return [*serial, (0.1, told(9, 1, 0x1018, 4)), (0.1, told(node, 5, 0x1018, 3))]
+
+    line = Line(answer)
+    # What came before it asked is no answer.
+    line.coming = [(0.0, told(2, 99, 0x1018, 4))]
+    assert devices_at(line, [2, 3]) == {2: [20, 21], 3: [30, 31]}
+    assert line.now == pytest.approx(0.2)
+    refused = Line(lambda frame: [(0.0, told(frame.identifier - 0x600, 0x06090011, 0x1018, 4, command=0x80))])
+    assert devices_at(refused, [2]) == {2: [None]}
+    assert [several_devices(found) for found in ([], [1], [1, None])] == [
+        "", "", "2 devices answer (serial numbers 1, not told)",
+    ]  # fmt: skip
+
+
+def test_an_identity_is_what_each_object_says_and_none_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_preflight, "devices_at", lambda _link, nodes: {nodes[0]: [99]})
+    table = {(0x1018, 1): 11, (0x1018, 2): 12, (0x1018, 3): 13, (0x1018, 4): 14, (0x6041, 0): 0x0250}
+    texts = {0x1008: "F-Axis", 0x100A: "F514"}
+
+    class Objects:
+        node = 5
+
+        def read(self, index: int, sub: int = 0) -> int:
+            if (index, sub) not in table:
+                raise SdoError("not there")
+            return table[index, sub]
+
+        def read_text(self, index: int) -> str:
+            if index not in texts:
+                raise SdoError("not there")
+            return texts[index]
+
+    link: Any = None
+    objects: Any = Objects()
+    full = {"node": 5, "device_type": 0x20192, "drive": True, "serials": [99], "vendor": 11, "product": 12,
+            "revision": 13, "serial": 14, "name": "F-Axis", "firmware": "F514", "state": "DISABLED"}  # fmt: skip
+    assert _preflight._identity(link, objects, 0x20192) == full
+    assert _preflight._identity(link, objects, 0x20191)["drive"] is False
+    table.clear()
+    texts.clear()
+    known = {"node", "device_type", "drive", "serials"}
+    assert _preflight._identity(link, objects, 0x20192) == {k: v if k in known else None for k, v in full.items()}
+
+
+@pytest.mark.parametrize(("at", "heard"), [(0.0, True), (0.99, True), (1.01, False)])
+@pytest.mark.parametrize(("frame", "foreign"), [(Frame(0x080), True), (Frame(0x201), True), (Frame(0x27E), True),
+                                                (Frame(0x27F), False), (Frame(0x181), False)])  # fmt: skip
+def test_one_listens_for_a_second_to_every_number(at: float, heard: bool, frame: Frame, foreign: bool) -> None:
+    line = Line()
+    line.coming = [(0.0, Frame(0x181)), (at, frame)]
+    if heard and foreign:
+        with pytest.raises(CheckFailedError, match="another master is on the bus"):
+            _preflight.require_alone(line)
+        return
+    _preflight.require_alone(line)
+    assert line.now == 1.0
+    # The pre-flight listens for its own drives: other numbers are not its own.
+    line = Line()
+    line.coming = [(0.5, Frame(0x204))]
+    assert listen(line, [1, 2, 3]) == ""
+    line.coming = [(line.now + 0.5, Frame(0x203))]
+    assert listen(line, [1, 2, 3]) == "set-points to node 3"
 
 
 # -- guarding ---------------------------------------------------------------------------------------------------------
