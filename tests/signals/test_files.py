@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 
 from softneck.core import DataError, FileFormatError, OutputFileError, SoftneckError
 from softneck.identification.models._fitting import row_hashes
+from softneck.robot import Robot
 from softneck.signals import SET_POINTS, Recording, concatenate, read_recording, write_recording
 from softneck.signals.recording import _files
 from softneck.signals.recording._channels import known_channels
-from softneck.signals.recording._files import read_plain_csv
+from softneck.signals.recording._files import open_recording, read_plain_csv, recording_names
 
 from ..data import changed, csv_lines, neck_recording
 
@@ -225,3 +226,130 @@ def test_a_parquet_file_of_something_else(tmp_path: Path, cell: object) -> None:
     pd.DataFrame({"time [s]": [0.0, 0.02], "pitch [deg]": [cell, cell]}).to_parquet(tmp_path / "a.parquet")
     with pytest.raises(DataError, match=r"pitch|missing"):
         read_recording(tmp_path / "a.parquet")
+
+
+# -- whatever may stand for a recording -------------------------------------------------------------------------------
+
+
+def same(one: Recording, other: Recording) -> bool:
+    return (
+        set(one.channels) == set(other.channels)
+        and one.robot.hash == other.robot.hash
+        and one.sample_time == pytest.approx(other.sample_time, rel=1e-9)
+        and all(np.allclose(one.channels[name], other.channels[name], rtol=1e-12) for name in one.channels)
+        and one.run.tolist() == other.run.tolist()
+    )
+
+
+def test_a_recording_is_opened_from_all_that_holds_one(tmp_path: Path) -> None:
+    recording = concatenate([neck_recording(60), neck_recording(40, seed=3)])
+    write_recording(tmp_path / "a.csv", recording)
+    table = recording.to_pandas()
+    for thing in (recording, tmp_path / "a.csv", str(tmp_path / "a.csv"), table, table.set_index("time [s]"),
+                  {title: table[title].to_numpy() for title in table}, [*recording.runs()], (recording,)):  # fmt: skip
+        assert same(open_recording(thing), recording)
+    assert open_recording(recording, recording.robot) is recording
+    with pytest.raises(DataError, match="the robot and a recording of two robots cannot be used together"):
+        open_recording(recording, "finger")
+    # Several are named by their files, else by their numbers.
+    slow = Recording(2 * recording.time[:60], 0.04, recording.rows(0, 60).channels)
+    with pytest.raises(DataError, match=rf"\({tmp_path / 'a.csv'} and recording 2\)"):
+        open_recording([tmp_path / "a.csv", slow])
+    assert recording_names(["a.csv", slow, Path("b.csv")]) == ["a.csv", "recording 2", "b.csv"]
+
+
+def test_an_array_is_a_recording_of_a_robot_that_is_named() -> None:
+    robot = Robot.from_dict({"name": "slow", "extends": "neck", "sample_time_s": 4.0})
+    U, Y = np.arange(18.0).reshape(6, 3), 0.1 * np.arange(12.0).reshape(6, 2)
+    Y[2, 1] = np.nan
+    both, alone = open_recording(np.hstack([U, Y]), robot), open_recording(U, robot)
+    for made in (both, alone):
+        assert (made.sample_time, made.robot.hash) == (4.0, robot.hash)
+        np.testing.assert_array_equal(made.set_points, U)
+    np.testing.assert_array_equal(both.outputs, Y)
+    assert np.isnan(alone.outputs).all()
+    for wrong in (U[:, :2], np.hstack([U, Y, Y]), U[:, 0], np.hstack([U, Y])[:, :4]):
+        with pytest.raises(DataError, match="recording"):
+            open_recording(wrong, robot)
+    for thing, hint in ((U, "an array needs `robot=`"), (3.0, "got a float"), (None, "got a NoneType")):
+        with pytest.raises(DataError, match=rf"a list of them is needed; {hint}\."):
+            open_recording(thing)
+
+
+def test_a_table_names_its_robot_and_one_that_is_given_goes_first() -> None:
+    finger = Robot.preset("finger")
+    made = Recording.from_arrays(np.zeros((5, len(finger.set_points))), robot=finger)
+    table = made.with_channels(**dict.fromkeys(finger.outputs.names, np.zeros(5))).to_pandas()
+    assert Recording.from_pandas(table).robot.hash == finger.hash
+    with pytest.raises(DataError, match=r"is not a channel|cannot be in|needs the channels"):
+        Recording.from_pandas(table, robot="arm")
+    for nothing in ({"pitch [deg]": [1.0], "roll [deg]": [1.0, 2.0]}, {"a": object()}):
+        with pytest.raises(DataError, match="the columns do not make a table"):
+            open_recording(nothing)
+
+
+@pytest.mark.parametrize(
+    ("text", "plain"),
+    [
+        ("a,b\n1,2\n", {"a": [1.0], "b": [2.0]}), ("a,b\n1,\n\n-2.5e1,+3\n", {"a": [1.0, -25.0], "b": [np.nan, 3.0]}),
+        ("# robot x\na\n1\n", {"a": [1.0]}), ("a,b\r\n1,2\r\n", {"a": [1.0], "b": [2.0]}),
+        ("a,b\n1\n", None), ("a,b\n1,2,3\n", None), ("a,a\n1,2\n", None), ("a,\n1,2\n", None), ("a,b\n", None),
+        ("a,b\n1,x\n", None), ('"a",b\n1,2\n', None), ("a,b\n1,-\n", None), ("a,b\n1, 2\n", None),
+    ],
+)  # fmt: skip
+def test_a_plain_table_is_numbers_under_titles_that_differ(text: str, plain: dict | None, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_bytes(text.encode())
+    found = read_plain_csv(path)
+    assert (found is None) is (plain is None)
+    if found is not None and plain is not None:
+        assert list(found) == list(plain)
+        for name, values in plain.items():
+            np.testing.assert_array_equal(found[name], values)
+
+
+def test_a_plain_table_may_be_as_large_as_it_is_read_fast(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("a\n12\n")
+    for most, read in ((5, True), (4, False)):
+        monkeypatch.setattr(_files, "_MAX_PLAIN_BYTES", most)
+        assert (read_plain_csv(path) is not None) is read
+    path.write_bytes(b"a\n\xff\n")
+    monkeypatch.undo()
+    assert read_plain_csv(path) is None
+    assert read_plain_csv(tmp_path / "none.csv") is None
+
+
+def test_missing_samples_are_allowed_where_a_sensor_may_miss_one() -> None:
+    values = pd.Series(["1", None, "NaN", "2"], dtype=object)
+    plain = np.array([1.0, np.nan])
+    np.testing.assert_array_equal(_files.numbers(plain, "x", missing=True), plain)
+    for column, missing, words, said in (
+        (plain, False, False, "an empty cell at row 1"), (values, False, False, "an empty cell at row 1"),
+        (values, True, False, "`NaN` at row 2"), (values, False, True, "an empty cell at row 1"),
+    ):  # fmt: skip
+        with pytest.raises(DataError, match=rf"column `x` holds {said}"):
+            _files.numbers(column, "x", missing=missing, nan_words=words)
+    np.testing.assert_array_equal(_files.numbers(values, "x", missing=True, nan_words=True), [1.0, np.nan, np.nan, 2.0])
+    with pytest.raises(DataError, match="`one two` at row 0"):
+        _files.numbers(pd.Series(["one\n two", "3"]), "x", missing=True, nan_words=True)
+
+
+@pytest.mark.parametrize("bad", [0.5, np.nan, np.inf, 2.0**53, -(2.0**53)])
+def test_runs_are_numbered_by_integers_that_a_float_holds(bad: float) -> None:
+    for column in (np.array([1.0, bad]), pd.Series([1.0, bad])):
+        with pytest.raises(DataError, match="column `run`"):
+            _files.integers(column)
+    assert _files.integers(np.array([2.0**53 - 1, -3.0])).tolist() == [2**53 - 1, -3]
+
+
+@pytest.mark.parametrize("name", ["pitch", "roll", "motor_position_2"])
+def test_a_sensor_without_any_sample_is_named_with_what_to_do(name: str, tmp_path: Path) -> None:
+    silent = neck_recording(30).with_channels(**{name: np.full(30, np.nan)})
+    hint = "Leave the column out" if name.startswith("motor") else "A recording needs it; record it again"
+    with pytest.raises(DataError, match=rf"channel `{name}` has no sample in any of its 30 rows; .* {hint}\."):
+        write_recording(tmp_path / "a.csv", silent)
+    assert not list(tmp_path.iterdir())
+    # One sample is enough.
+    silent.channels[name][29] = 0.1  # pyright: ignore[reportIndexIssue]
+    write_recording(tmp_path / "a.csv", silent)

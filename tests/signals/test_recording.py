@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.robot import Robot
+from softneck.robot import Robot, Scaling
 from softneck.signals import Recording, concatenate
+from softneck.signals.recording._recording import (
+    check_rising,
+    conditions,
+    median_step,
+    merge_conditions,
+    scale_recording,
+)
 
 from ..data import TS, neck_recording, with_time
 
@@ -154,3 +161,153 @@ def test_set_points_alone_have_outputs_that_were_not_measured() -> None:
     alone = Recording.from_arrays(np.zeros((5, 3)))
     assert np.isnan(alone.outputs).all()
     assert alone.outputs.shape == (5, 2)
+
+
+# -- arrays, runs, conditions ------------------------------------------------------------------------------------------
+
+
+def test_rows_of_arrays_are_equidistant_and_each_run_begins_at_zero() -> None:
+    U = np.arange(21.0).reshape(7, 3)
+    run = [3, 3, 3, 5, 5, 3, 3]
+    made = Recording.from_arrays(U, 0.01 * U[:, :2], motor_positions=-U, sample_time=0.5, run=run)
+    assert made.time.tolist() == [0.0, 0.5, 1.0, 0.0, 0.5, 0.0, 0.5]
+    assert [part.run[0] for part in made.runs()] == [3, 5, 3]
+    assert (made.set_points.tolist(), made.motor_positions.tolist()) == (U.tolist(), (-U).tolist())
+    assert made.outputs.tolist() == (0.01 * U[:, :2]).tolist()
+    plain = Recording.from_arrays(U)
+    assert (plain.sample_time, plain.run.tolist(), plain.time[1]) == (0.02, [0] * 7, 0.02)
+    slow = Robot.from_dict({"name": "slow", "extends": "neck", "sample_time_s": 4.0})
+    assert Recording.from_arrays(U, robot=slow).sample_time == 4.0
+    assert Recording.from_arrays(U, robot=slow, sample_time=0.5).sample_time == 0.5
+
+
+@pytest.mark.parametrize("run", [[0, 0, 1], [0.0] * 4, [[0] * 4], [True] * 4], ids=str)
+def test_numbers_of_runs_are_integers_one_a_row(run: list) -> None:
+    with pytest.raises(DataError, match=r"`run` must be integers of shape \(4,\); got"):
+        Recording.from_arrays(np.zeros((4, 3)), run=run)
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_a_summary_counts_rows_and_runs(rows: int) -> None:
+    made = concatenate([neck_recording(100)] * rows)
+    first, second = made.summary().splitlines()
+    assert first == f"{100 * rows} rows of 20 ms in {rows} run(s), robot neck"
+    assert second.startswith("set-points of 3 motors, ")
+    assert "pitch, roll" in second
+    assert "setpoint" not in second
+
+
+@pytest.mark.parametrize("Ts", [1e-6, 1e-3, 4.0])
+def test_sample_times_are_the_same_to_a_millionth_at_any_pace(Ts: float) -> None:
+    def of(sample_time: float) -> Recording:
+        return Recording(sample_time * np.arange(50), sample_time, neck_recording(50).channels)
+
+    assert concatenate([of(Ts), of(Ts * (1.0 + 5e-7))]).sample_time == Ts
+    for factor in (1.0 + 5e-6, 1.0 - 5e-6):
+        with pytest.raises(DataError, match="different sample times"):
+            concatenate([of(Ts), of(Ts * factor)])
+
+
+def test_recordings_put_together_keep_what_all_have_and_a_payload_of_one_is_zero_elsewhere() -> None:
+    one = neck_recording(100, positions=False).with_channels(payload=np.full(100, 0.7), compression=np.zeros(100))
+    two = neck_recording(120, seed=2)
+    for parts in ([one, two], [two, one]):
+        both = concatenate(parts)
+        assert set(both.channels) == set(one.channels) - {"compression"}
+        assert [set(part.channels["payload"]) for part in both.runs()] == [
+            {0.7} if len(part) == 100 else {0.0} for part in both.runs()
+        ]
+    with pytest.raises(DataError, match=r"\(first\.csv and second\.csv\)"):
+        concatenate([one, Recording(two.time * 2, 2 * TS, two.channels)], names=["first.csv", "second.csv"])
+
+
+def test_conditions_are_the_range_of_payload_and_of_the_mean_set_point() -> None:
+    U = np.array([[1.0, 2.0, 6.0], [0.0, -3.0, 0.0], [1.0, 1.0, 1.0]])
+    plain = Recording.from_arrays(U)
+    loaded = plain.with_channels(payload=np.array([0.2, 0.9, 0.4]))
+    assert conditions(plain) == {"payload_kg": [0.0, 0.0], "cocontraction": [-1.0, 3.0]}
+    assert conditions(loaded) == {"payload_kg": [0.2, 0.9], "cocontraction": [-1.0, 3.0]}
+    other = {"payload_kg": [0.5, 1.5], "cocontraction": [0.0, 2.0]}
+    for parts in ([conditions(loaded), other], [other, conditions(loaded)]):
+        assert merge_conditions(parts) == {"payload_kg": [0.2, 1.5], "cocontraction": [-1.0, 3.0]}
+    assert merge_conditions([]) == {}
+
+
+def test_a_recording_is_scaled_where_it_has_units_and_nowhere_else() -> None:
+    """Of a robot in kPa and mm at 2 s: motors, outputs and times have each their factor, loads and flags none."""
+    robot = Robot.from_dict({
+        "name": "bellows", "time_constant_s": 2.0, "directions": {"kind": "matrix", "matrix": [[1.0]]},
+        "motors": {"names": ["p"], "unit": "kPa", "nominal": 50.0},
+        "outputs": {"names": ["x"], "unit": "mm", "nominal": 30.0},
+    })  # fmt: skip
+    scaling = Scaling.of(robot)
+    t = np.arange(8.0)
+    made = Recording.from_arrays(
+        1e3 * t[:, None], 1e-3 * t[:, None], motor_positions=2e3 * t[:, None], sample_time=0.4, robot=robot
+    ).with_channels(payload=t)
+    found = scale_recording(made, scaling)
+    # Scaled numbers are rounded to 2^-40.
+    np.testing.assert_allclose(found.set_points, scaling.scale_motors(made.set_points), atol=1e-12)
+    np.testing.assert_allclose(found.motor_positions, 2.0 * found.set_points, atol=3e-12)
+    np.testing.assert_allclose(found.outputs, scaling.scale_outputs(made.outputs), atol=1e-12)
+    assert np.abs(found.set_points - made.set_points).max() > 1.0
+    np.testing.assert_array_equal(found.channels["payload"], t)
+    assert found.sample_time == pytest.approx(0.4 / scaling.second)
+    np.testing.assert_allclose(found.time, made.time / scaling.second)
+    without = scale_recording(Recording.from_arrays(1e3 * t[:, None], robot=robot), scaling)
+    assert not without.has_motor_positions
+    neck = neck_recording(100)
+    assert scale_recording(neck, Scaling.of(neck.robot)) is neck
+
+
+# -- times ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("Ts", [1e-6, 1e-3, 0.02, 4.0])
+def test_a_sample_time_is_the_mean_of_the_regular_steps_inside_the_runs(Ts: float) -> None:
+    k = np.arange(60)
+    run = np.repeat([0, 1], 30)
+    jittered = Ts * (k + 0.3 * (k % 2))
+    assert median_step(jittered, np.zeros(0)) == pytest.approx(Ts, rel=0.02)
+    # A step of half as much again or half as long is an irregular one; a pause between runs is no step.
+    for odd, counted in ((1.51, 0), (0.49, 0), (1.49, 1), (0.51, 1)):
+        time = Ts * k
+        time[40:] += (odd - 1.0) * Ts
+        mean = Ts * (1.0 + counted * (odd - 1.0) / 58.0)
+        assert median_step(time, run) == pytest.approx(mean, rel=1e-9)
+    paused = Ts * (k + 1000.0 * (k >= 30))
+    assert median_step(paused, run) == pytest.approx(Ts, rel=1e-9)
+    for rows in (0, 1):
+        with pytest.raises(DataError, match=f"at least 2 rows; got {rows}"):
+            median_step(Ts * k[:rows], np.zeros(0))
+    assert median_step(Ts * k[:2], np.zeros(0)) == pytest.approx(Ts)
+
+
+def test_times_that_stand_are_allowed_where_they_are_made_even_later() -> None:
+    run = np.zeros(4)
+    check_rising(np.array([0.0, 1.0, 1.0, 2.0]), run, may_stand=True)
+    check_rising(np.array([0.0, 1.0, 0.5, 2.0]), np.array([0, 0, 1, 1]))
+    for time, may_stand in (([0.0, 1.0, 1.0, 2.0], False), ([0.0, 1.0, 0.9, 2.0], True)):
+        with pytest.raises(DataError, match="at row 2"):
+            check_rising(np.array(time), run, may_stand=may_stand)
+
+
+def test_angles_up_to_half_a_turn_are_taken_and_each_output_is_looked_at() -> None:
+    limit = Robot.preset("neck").angle_limit
+    for name in ("pitch", "roll"):
+        for sign in (-1.0, 1.0):
+            at = np.where(np.arange(100) == 4, sign * limit, 0.0)
+            neck_recording(100).with_channels(**{name: at})
+            with pytest.raises(DataError, match=rf"channel `{name}` is -?3\.14\d+ rad at row 4, more than half a turn"):
+                neck_recording(100).with_channels(**{name: np.nextafter(1.0, 2.0) * at})
+
+
+def test_a_part_is_split_off_where_one_of_its_runs_has_rows_on_both_sides() -> None:
+    """Runs that are too short to be cut go to one side whole."""
+    runs = concatenate([neck_recording(100), neck_recording(50).rows(0, 1)])
+    head, tail = runs.split(0.7)
+    assert ([len(part) for part in head.runs()], [len(part) for part in tail.runs()]) == ([70, 1], [30])
+    head, tail = runs.split(0.3)
+    assert ([len(part) for part in head.runs()], [len(part) for part in tail.runs()]) == ([30], [70, 1])
+    with pytest.raises(DataError, match=r"1 rows cannot be split at 0\.3"):
+        runs.runs()[1].split(0.3)

@@ -38,6 +38,47 @@ def test_missed_samples_stay_missed_and_each_run_comes_near_the_first() -> None:
     assert np.nanmax(np.abs(y - y[0] - (x - x[0]))) < 1e-10
 
 
+@pytest.mark.parametrize("turn", [1.0, 360.0, 1e-3])
+def test_a_turn_may_be_in_any_unit(turn: float) -> None:
+    """What is a wrap in radians is one in turns, in degrees and in thousands of them."""
+    factor, run = turn / TURN, np.repeat([0, 1], 200)
+    for x in (walk(1) % TURN, 0.05 * np.arange(400.0) % TURN - 0.6 * TURN, np.sin(np.arange(400.0)) % TURN):
+        y, jumps = unwrap(x, run, TURN)
+        scaled, found = unwrap(factor * x, run, turn)
+        assert found == jumps
+        np.testing.assert_allclose(scaled, factor * y, atol=1e-9 * turn)
+
+
+def sawtooth(rows: int = 200, period: int = 40, *, step: float = 1.0, low: float = 0.0) -> np.ndarray:
+    """Return an angle in turns that rises evenly and falls back by `step` at the end of each period."""
+    return low + step * (np.arange(rows) % period) / period
+
+
+@pytest.mark.parametrize(
+    ("x", "counted"),
+    [
+        # Fifty samples tell an ordinary step.
+        (sawtooth(50), True), (sawtooth(49), False), (np.append(sawtooth(49), np.nan), False),
+        # The edges of a turn, overrun by a thousandth at most.
+        (sawtooth(low=0.0249), True), (sawtooth(low=0.0261), False), (sawtooth(low=-0.0009), True),
+        (sawtooth(low=-0.0011), False), (sawtooth(low=-0.5009), True), (sawtooth(low=-0.5011), False),
+        (sawtooth(low=-0.4741), True), (sawtooth(low=-0.4739), False),
+        # Without its turn the step of a jump is at most a tenth of one, where others are short ...
+        (sawtooth(period=100, step=0.92), True), (sawtooth(period=100, step=0.90), False),
+        # ... or three times as long as those, and a quarter of a turn at most.
+        (sawtooth(period=10, step=0.9), True), (sawtooth(period=10, step=0.84), True),
+        (sawtooth(period=10, step=0.83), False), (sawtooth(period=5, step=0.95), True),
+        (sawtooth(period=5, step=0.93), False),
+        # As many as three of ten steps are jumps, and three of ten rows at least move.
+        (sawtooth(301, period=4, step=1.0), True), (sawtooth(301, period=3, step=1.0), False),
+        (np.repeat(sawtooth(100), 3), True), (np.repeat(sawtooth(100), 4), False),
+    ],
+)  # fmt: skip
+def test_the_edges_of_what_a_wrap_is(x: np.ndarray, counted: bool) -> None:
+    here = x[np.isfinite(x)]
+    assert count_wraps(x, 1.0) == (np.count_nonzero(np.diff(here) < -0.5) if counted else 0)
+
+
 @pytest.mark.parametrize(
     "x",
     [

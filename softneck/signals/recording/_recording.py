@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -302,7 +303,7 @@ def concatenate(recordings: Sequence[Recording], *, names: Sequence[str] = ()) -
     parts: list[Recording] = []
     called = names or [f"recording {number}" for number in range(1, len(recordings) + 1)]
     for name, recording in zip(called, recordings, strict=True):
-        if not np.isclose(recording.sample_time, first.sample_time, rtol=1e-6):
+        if not math.isclose(recording.sample_time, first.sample_time, rel_tol=1e-6):
             raise DataError(
                 f"recordings of different sample times cannot be used together: {first.sample_time:g} s and "
                 f"{recording.sample_time:g} s ({called[0]} and {name}). Work on each by itself, or bring one to the "
