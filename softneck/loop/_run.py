@@ -185,7 +185,7 @@ class LoopRows:
     def _linked(self) -> tuple[Callable[..., tuple[int, int]], tuple, tuple]:
         """The compiled rows, and their plan and parts."""
         parts = [part for part in self._parts if _is_its_block(part)]
-        function = load_linked(_ROWS_RUNTIME, [part.block.runtime for part in parts]).run_rows
+        function = load_linked(_ROWS_RUNTIME, "run_rows", [part.block.runtime for part in parts])
         memories = tuple(zip(*(part.memory[:2] for part in parts), strict=True))
         actions = tuple(np.array(column, dtype=np.int64) for column in self._actions)
         return function, (actions, *self._plan[1:]), (tuple(part.block.arrays for part in parts), *memories)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 import platformdirs
@@ -19,6 +19,7 @@ from softneck.core import atomic_write
 
 from ._bundle import bundle, content_name
 from ._numba_cache import compile_without_failing_cache, numba_cache_name
+from ._numba_inner import pipelines
 from ._own import PREFIX
 from ._tangent import with_tangent
 
@@ -60,7 +61,7 @@ def load_runtime(module: str, *, compiled: bool = True) -> Runtime:
         return _runtime(module, compiled and PREFIX not in module)  # Python objects step in plain Python
 
 
-def load_functions(module: str, *, compiled: bool = True) -> ModuleType:
+def load_functions(module: str, *, compiled: bool = True) -> Any:
     """Return a namespace with the functions of runtime module `module`, which has no `step` of its own."""
     with _LOADING:
         return _functions(module, compiled and PREFIX not in module)
@@ -73,7 +74,7 @@ def load_tangent(module: str, *, compiled: bool = True) -> Callable[..., None]:
         TangentError: its step has no derivative.
     """
     with _LOADING:
-        return _tangent(module, compiled).step_tangent
+        return _tangent(module, compiled)
 
 
 @cache
@@ -87,34 +88,35 @@ def _runtime(module: str, compiled: bool) -> Runtime:
 
 
 @cache
-def _functions(module: str, compiled: bool) -> ModuleType:
-    return _namespace(bundle(module, loops=False), compiled)
+def _functions(module: str, compiled: bool) -> Any:
+    namespace = _import_text(bundle(module, loops=False), compiled=compiled)
+    functions = {name: value for name, value in vars(namespace).items() if isinstance(value, FunctionType)}
+    if not (compiled and _compile(namespace, ())):
+        return namespace
+    # Which of them Python calls is not known: each once for Python, calling the inner ones, compiled when it is called.
+    return SimpleNamespace(**vars(namespace) | {name: _compiled(value, inner=False) for name, value in functions.items()})
 
 
 @cache
-def _tangent(module: str, compiled: bool) -> ModuleType:
-    return _namespace(with_tangent(bundle(module, loops=False)), compiled)
-
-
-def _namespace(text: str, compiled: bool) -> ModuleType:
-    namespace = _import_text(text, compiled=compiled)
+def _tangent(module: str, compiled: bool) -> Callable[..., None]:
+    namespace = _import_text(with_tangent(bundle(module, loops=False)), compiled=compiled)
     if compiled:
-        _compile(namespace)
-    return namespace
+        _compile(namespace, ("step_tangent",))
+    return namespace.step_tangent
 
 
-def load_linked(module: str, runtimes: Sequence[str]) -> ModuleType:
-    """Return the functions of runtime module `module`, whose `part_step(part, ...)` calls the step of `runtimes[part]`.
+def load_linked(module: str, called: str, runtimes: Sequence[str]) -> Callable[..., Any]:
+    """Return function `called` of runtime module `module`, whose `part_step(part, ...)` calls that of `runtimes[part]`.
 
     The steps are those that `load_runtime` compiled: they are linked, not compiled again, and give equal results to the
     bit. Their data is `parts` = (arrays, parameters, states), each with one entry for each part.
     """
     with _LOADING:
-        return _link_parts(module, tuple(runtimes))
+        return _link_parts(module, called, tuple(runtimes))
 
 
 @cache
-def _link_parts(module: str, runtimes: tuple[str, ...]) -> ModuleType:
+def _link_parts(module: str, called: str, runtimes: tuple[str, ...]) -> Callable[..., Any]:
     lines = ["from softneck.runtime import load_runtime"]
     for i, runtime in enumerate(runtimes):
         # The hash of the runtime is part of this text, as a statement: another runtime makes another module and cache.
@@ -127,8 +129,8 @@ def _link_parts(module: str, runtimes: tuple[str, ...]) -> ModuleType:
     lines.append("    return False")  # no part has this index
     text = bundle(module, loops=False, skip=("part_step",)) + "\n".join(lines) + "\n"
     namespace = _import_text(text, compiled=True)
-    _compile(namespace)
-    return namespace
+    _compile(namespace, (called,))
+    return getattr(namespace, called)
 
 
 def compiled_name(text: str) -> str:
@@ -145,19 +147,28 @@ def have_numba() -> bool:
     return importlib.util.find_spec("numba") is not None
 
 
-def _compile(namespace: ModuleType, called: Sequence[str] | None = None) -> bool:
+def _compile(namespace: ModuleType, called: Sequence[str]) -> bool:
+    """Compile the functions of a bundle, of which Python calls `called`; return whether numba is installed."""
     if not have_numba():
         return False
-    from numba import njit
-
     _shorten_shape_errors()
     if "COMPILED" in vars(namespace):
         vars(namespace)["COMPILED"] = 1  # see `_compiled_runtime`; numba takes it as a constant
     for name, value in list(vars(namespace).items()):
         if isinstance(value, FunctionType):
-            inner = {} if called is None or name in called else _INNER
-            setattr(namespace, name, compile_without_failing_cache(njit(**COMPILE_OPTIONS, **inner)(value)))
+            setattr(namespace, name, _compiled(value, inner=name not in called))
     return True
+
+
+def _compiled(function: FunctionType, *, inner: bool) -> Any:
+    """Return numba's function, which it compiles when it is called; an inner one is for other compiled functions."""
+    from numba import njit
+
+    made = pipelines()
+    options = COMPILE_OPTIONS if made is None else COMPILE_OPTIONS | {"pipeline_class": made[inner]}
+    if inner:
+        options = options | _INNER | ({} if made is None else {"cache": False})
+    return compile_without_failing_cache(njit(**options)(function))
 
 
 @cache

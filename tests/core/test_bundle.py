@@ -238,7 +238,7 @@ def test_linked_steps_follow_what_they_link(
     for text in (STEP, WORDY, STEP.replace("= inputs[0]", "= 2.0 * inputs[0]")):
         (runtime_folder / "linked_a_runtime.py").write_text(text)
         _forget()
-        names.append(load_linked("softneck.loop._rows_runtime", ["linked_a_runtime"]).__name__)
+        names.append(load_linked("softneck.loop._rows_runtime", "run_rows", ["linked_a_runtime"]).__module__)
     # Comments change nothing; another step is another module, although its name is the same.
     assert names[0] == names[1] != names[2]
 

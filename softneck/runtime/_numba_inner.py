@@ -1,0 +1,80 @@
+"""numba pipelines that optimise a runtime once: inner functions are only linked into the functions that call them.
+
+numba alone optimises every function and makes machine code of it, although it does so again in each function that calls
+it: most of the time to compile a kind. Inner functions, which Python never calls, are left as they are lowered. Their
+text is optimised with the function that Python calls.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+# Of other versions the inside may differ; runtimes are then compiled in numba's own way.
+_FIRST, _LAST = (0, 60), (0, 68)
+
+
+@cache
+def pipelines() -> tuple[Any, Any] | None:
+    """Return the `pipeline_class` of functions that Python calls and of inner ones; None with another numba."""
+    import numba
+
+    if not _FIRST <= numba.version_info[:2] <= _LAST:
+        return None
+    from numba import _dynfunc
+    from numba.core.codegen import JITCodeLibrary
+    from numba.core.compiler import CompilerBase, DefaultPassBuilder, _LowerResult
+    from numba.core.compiler_machinery import register_pass
+    from numba.core.environment import lookup_environment
+    from numba.core.typed_passes import NativeLowering
+
+    class LinkedLibrary(JITCodeLibrary):
+        def finalize(self) -> None:
+            for library in dict.fromkeys(self._linking_libraries):
+                self._reload_init.update(library._reload_init)
+                self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+            self._final_module.verify()
+            self._finalized = True
+
+    @register_pass(mutates_CFG=True, analysis_only=False)
+    class InnerLowering(NativeLowering):
+        _name = "inner_lowering"
+
+        def run_pass(self, state: Any) -> bool:
+            state.library = LinkedLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+            state.library.enable_object_caching()
+            state.flags.no_compile = True
+            super().run_pass(state)
+            fndesc, call_helper, _, env = state["cr"]
+            # A function without code, which numba asks for: Python never calls it.
+            name = fndesc.qualname.rpartition(".")[2]
+            nothing = _dynfunc.make_function(fndesc.lookup_module(), name, "", 0, env, (state.library,))
+            state.targetctx.insert_user_function(nothing, fndesc, [state.library])
+            state.reload_init.extend(state.library._reload_init)
+            state["cr"] = _LowerResult(fndesc, call_helper, cfunc=nothing, env=env)
+            return True
+
+    @register_pass(mutates_CFG=True, analysis_only=False)
+    class OuterLowering(NativeLowering):
+        _name = "outer_lowering"
+
+        def run_pass(self, state: Any) -> bool:
+            super().run_pass(state)
+            # The inner functions got their place in memory now: tell them their environments.
+            for variable in state.library._final_module.global_variables:
+                env = lookup_environment(variable.name) if variable.name.startswith("_ZN08NumbaEnv") else None
+                if env is not None:
+                    state.library.codegen.set_env(variable.name, env)
+            return True
+
+    def compiler(lowering: Any) -> Any:
+        class Compiler(CompilerBase):
+            def define_pipelines(self) -> list[Any]:
+                made = DefaultPassBuilder.define_nopython_pipeline(self.state)
+                made.passes = [(lowering if step is NativeLowering else step, text) for step, text in made.passes]
+                made.finalize()
+                return [made]
+
+        return Compiler
+
+    return compiler(OuterLowering), compiler(InnerLowering)
