@@ -94,7 +94,9 @@ def _functions(module: str, compiled: bool) -> Any:
     if not (compiled and _compile(namespace, ())):
         return namespace
     # Which of them Python calls is not known: each once for Python, calling the inner ones, compiled when it is called.
-    return SimpleNamespace(**vars(namespace) | {name: _compiled(value, inner=False) for name, value in functions.items()})
+    return SimpleNamespace(
+        **vars(namespace) | {name: _compiled(value, inner=False) for name, value in functions.items()}
+    )
 
 
 @cache
@@ -165,7 +167,7 @@ def _compiled(function: FunctionType, *, inner: bool) -> Any:
     from numba import njit
 
     made = pipelines()
-    options = COMPILE_OPTIONS if made is None else COMPILE_OPTIONS | {"pipeline_class": made[inner]}
+    options: Any = COMPILE_OPTIONS if made is None else COMPILE_OPTIONS | {"pipeline_class": made[inner]}
     if inner:
         options = options | _INNER | ({} if made is None else {"cache": False})
     return compile_without_failing_cache(njit(**options)(function))

@@ -8,10 +8,10 @@ text is optimised with the function that Python calls.
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
-# Of other versions the inside may differ; runtimes are then compiled in numba's own way.
-_FIRST, _LAST = (0, 60), (0, 68)
+# It is tested with this version, as others may differ inside: with them, runtimes are compiled in numba's own way.
+_TESTED = (0, 68)
 
 
 @cache
@@ -19,9 +19,9 @@ def pipelines() -> tuple[Any, Any] | None:
     """Return the `pipeline_class` of functions that Python calls and of inner ones; None with another numba."""
     import numba
 
-    if not _FIRST <= numba.version_info[:2] <= _LAST:
+    if numba.version_info[:2] != _TESTED:
         return None
-    from numba import _dynfunc
+    from numba import _dynfunc  # pyright: ignore[reportAttributeAccessIssue]
     from numba.core.codegen import JITCodeLibrary
     from numba.core.compiler import CompilerBase, DefaultPassBuilder, _LowerResult
     from numba.core.compiler_machinery import register_pass
@@ -40,7 +40,7 @@ def pipelines() -> tuple[Any, Any] | None:
     class InnerLowering(NativeLowering):
         _name = "inner_lowering"
 
-        def run_pass(self, state: Any) -> bool:
+        def run_pass(self, state: Any) -> Literal[True]:
             state.library = LinkedLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
             state.library.enable_object_caching()
             state.flags.no_compile = True
@@ -58,7 +58,7 @@ def pipelines() -> tuple[Any, Any] | None:
     class OuterLowering(NativeLowering):
         _name = "outer_lowering"
 
-        def run_pass(self, state: Any) -> bool:
+        def run_pass(self, state: Any) -> Literal[True]:
             super().run_pass(state)
             # The inner functions got their place in memory now: tell them their environments.
             for variable in state.library._final_module.global_variables:

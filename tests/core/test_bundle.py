@@ -15,7 +15,7 @@ from softneck.core import KINDS, SettingsError, resolve
 from softneck.runtime import _bundle as bundle_module
 from softneck.runtime import bundle, load_runtime
 from softneck.runtime._bundle import content_name
-from softneck.runtime._compile import _link_parts, _runtime, compiled_name, load_linked
+from softneck.runtime._compile import _functions, _link_parts, _runtime, compiled_name, load_functions, load_linked
 
 from ..data import slow_but
 
@@ -241,6 +241,46 @@ def test_linked_steps_follow_what_they_link(
         names.append(load_linked("softneck.loop._rows_runtime", "run_rows", ["linked_a_runtime"]).__module__)
     # Comments change nothing; another step is another module, although its name is the same.
     assert names[0] == names[1] != names[2]
+
+
+DEEP = """
+import numpy as np
+
+
+def deep(x):
+    if x[0] < 0.0:
+        raise ValueError("negative", x[0])
+    return np.sqrt(x).sum()
+
+
+def factorial(n):
+    return 1 if n <= 1 else n * factorial(n - 1)
+
+
+def outer(x, n):
+    return deep(x) + deep(2.0 * x) + factorial(n)
+"""
+
+
+def test_inner_functions_are_linked_into_the_called_one_alone_and_raise_through_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runtime_folder: Path
+) -> None:
+    pytest.importorskip("numba")
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda *_a, **_k: str(tmp_path / "cache"))
+    (runtime_folder / "deep_a_runtime.py").write_text(DEEP)
+    x, plain = np.arange(3.0), load_functions("deep_a_runtime", compiled=False)
+    for hits in (0, 1):  # compiled, and from the cache
+        _functions.cache_clear()
+        found = load_functions("deep_a_runtime")
+        assert found.outer(x, 5) == plain.outer(x, 5)
+        with pytest.raises(ValueError, match="negative") as raised:
+            found.outer(-1.0 - x, 5)
+        # Numbers in an exception need the environment of the function that raises it.
+        assert raised.value.args == ("negative", -1.0)
+        assert sum(found.outer.stats.cache_hits.values()) == hits
+    # Machine code is made, and kept, of what Python called.
+    assert [path.name.split("-")[0].split(".")[-1] for path in (tmp_path / "cache").rglob("*.nbi")] == ["outer"]
+    assert found.deep(x) == plain.deep(x)
 
 
 def test_a_cache_folder_that_cannot_be_written_is_no_hindrance(
