@@ -82,7 +82,7 @@ class LinearLaw:
 
     def _response(self, frequency: Vector, B: Matrix, D: Matrix) -> np.ndarray:
         z = np.exp(1j * frequency * self.sample_time)
-        n = self.A.shape[0]
+        n = len(self.A)
         if n == 0:
             return np.broadcast_to(D.astype(complex), (z.size, *D.shape))
         inner = np.linalg.solve(z[:, None, None] * np.eye(n) - self.A, np.broadcast_to(B, (z.size, *B.shape)))
@@ -102,7 +102,7 @@ def radii(plants: Plants, law: LinearLaw) -> Vector:
 def closed_poles(plants: Plants, law: LinearLaw) -> np.ndarray:
     """Return the poles (n, N) of every closed loop, its delay exact."""
     A, B, C = _plant_matrices(plants)
-    n, order, nc = len(plants), A.shape[1], law.A.shape[0]
+    n, order, nc = len(plants), A.shape[1], len(law.A)
     closed = np.zeros((n, order + nc, order + nc))
     closed[:, :order, :order] = A + B @ law.Dy @ C
     closed[:, :order, order:] = B @ law.C

@@ -295,7 +295,7 @@ def make_plants(neck: PlantSource, numbers: np.ndarray, names: list[str], *, sou
     # Zeros appended to both polynomials of an axis are poles and zeros at 0 that cancel.
     numerator, denominator = (np.stack([part[k] for part in padded], axis=1) for k in (0, 1))
     delay = np.stack([part[2] for part in parts], axis=1)
-    n = numbers.shape[0]
+    n = len(numbers)
     return Plants(
         Ts, numbers, np.tile(neck.cross, (n, 1)), tuple(names), np.full(n, source), numerator, denominator, delay,
         neck.names, neck.gain_unit.replace("/", "_per_"),
@@ -351,7 +351,7 @@ def _plants_of(neck: PlantSource, count: int, seed: int, source: int) -> Plants:
         texts = ["".join("+" if value > 0 else "-" for value in s) for s in chosen]
         told = ", ".join(f"{text} of {axis}" for text, axis in zip(texts, neck.names, strict=True))
         names.append(f"{neck.name}: corner {told}")
-    sizes = [box.samples.shape[0] for box in neck.axes]
+    sizes = [len(box.samples) for box in neck.axes]
     for k in range(max(sizes)):
         rows = [k % size for size in sizes]
         numbers.append(np.stack([box.samples[row] for box, row in zip(neck.axes, rows, strict=True)]))

@@ -153,7 +153,7 @@ def _run(
     for axis, name in enumerate(axes):
         if f"{name}_reference_ahead" in names:  # predictive controllers see the step from the start
             start[names.index(f"{name}_reference_ahead")] = signals[0, axis]
-    n, rows = len(plants), signals.shape[0]
+    n, rows = len(plants), len(signals)
     angles, motors = np.empty((n, rows, len(axes))), np.empty((n, rows, len(set_points)))
     mixed = mixing_matrix(plants.cross, len(axes))
 

@@ -82,11 +82,11 @@ class _Task:
 
     def plants(self, x: Matrix, name: str = "") -> Plants:
         """Return the plants at x (n, 3 axes), from 0 to 1 across the box, without the order's delay."""
-        numbers = np.tile(np.stack([box.nominal for box in self.neck.axes]), (x.shape[0], 1, 1))
+        numbers = np.tile(np.stack([box.nominal for box in self.neck.axes]), (len(x), 1, 1))
         for k, axis in enumerate(self.axes):
             box = self.neck.axes[axis]
             numbers[:, axis] = box.low + x[:, 3 * k : 3 * k + 3] * (box.high - box.low)
-        return make_plants(self.neck, numbers, [f"{self.neck.name}: {name}"] * x.shape[0], source=self.source)
+        return make_plants(self.neck, numbers, [f"{self.neck.name}: {name}"] * len(x), source=self.source)
 
     def badness(self, x: Matrix) -> Vector:
         """Return the objective (n,) at x (3 axes, n), which scipy minimises."""

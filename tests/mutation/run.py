@@ -188,7 +188,7 @@ def try_mutant(root: Path, area: Area, mutant: Mutant, equivalent: list[dict[str
     if code == 5:
         raise SystemExit(f"area {area.name} has no tests")
     outcome = "hung" if code is None else "survived" if code == 0 else "killed"
-    changed = [line[1:].strip() for line in diff.splitlines() if line.startswith("+") and not line.startswith("+++")]
+    changed = {line[1:].strip() for line in diff.splitlines() if line[:1] in "+-" and line[:3] not in ("+++", "---")}
     if outcome == "survived" and any(item["file"] == mutant.path and item["line"] in changed for item in equivalent):
         outcome = "equivalent"
     return Outcome(mutant, outcome, time.monotonic() - begin, diff)

@@ -68,12 +68,8 @@ def innovations_gain(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> Matrix:
     """
     from scipy.linalg import solve_discrete_are
 
-    n, m = A.shape[0], C.shape[0]
-    # In units of what a reference does, so that the spread is relative.
-    size = max(float(np.linalg.norm(B)), 1e-12)
-    Q = B @ B.T + (_STATE_NOISE_RATIO * size) ** 2 * np.eye(n)
-    v = max(float(np.linalg.norm(D, 2)), 1e-3 * float(np.abs(C @ B).max(initial=0.0)), 1e-9)
-    R, S = v * v * (1.0 + _STATE_NOISE_RATIO) * np.eye(m), B @ D.T
+    Q, v = _noise_of_reference(B, C, D)
+    R, S = v * v * (1.0 + _STATE_NOISE_RATIO) * np.eye(len(C)), B @ D.T
     try:
         P = solve_discrete_are(A.T, C.T, Q, R, s=S)
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -84,6 +80,14 @@ def innovations_gain(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> Matrix:
     return np.asarray(np.linalg.solve((C @ P @ C.T + R).T, (A @ P @ C.T + S).T).T)
 
 
+def _noise_of_reference(B: Matrix, C: Matrix, D: Matrix) -> tuple[Matrix, float]:
+    """Return the covariance (n, n) of the state under r as white noise, and the size of what r does to v at once."""
+    # In units of what a reference does, so that the spread is relative.
+    size = max(float(np.linalg.norm(B)), 1e-12)
+    Q = B @ B.T + (_STATE_NOISE_RATIO * size) ** 2 * np.eye(len(B))
+    return Q, max(float(np.linalg.norm(D, 2)), 1e-3 * float(np.abs(C @ B).max(initial=0.0)), 1e-9)
+
+
 def conditioning_candidates(axis: AxisController) -> list[Matrix]:
     """Return gains L that may do better than Hanus' under slew limits: predictors that trust the limited output more.
 
@@ -91,10 +95,7 @@ def conditioning_candidates(axis: AxisController) -> list[Matrix]:
     """
     from scipy.linalg import solve_discrete_are
 
-    n = axis.A.shape[0]
-    size = max(float(np.linalg.norm(axis.Br)), 1e-12)
-    Q = axis.Br @ axis.Br.T + (_STATE_NOISE_RATIO * size) ** 2 * np.eye(n)
-    v = max(abs(axis.Dr), 1e-3 * float(np.abs(axis.C @ axis.Br).max(initial=0.0)), 1e-9)
+    Q, v = _noise_of_reference(axis.Br, axis.C, np.array([[axis.Dr]]))
     found = []
     for noise in _OUTPUT_NOISE_RATIOS:
         R = np.array([[noise * v * v]])
@@ -113,7 +114,7 @@ def conditioning_candidates(axis: AxisController) -> list[Matrix]:
 
 def feedback_response(axis: AxisController, z: np.ndarray) -> np.ndarray:
     """Return K(z) (m,) of `v = -K y`."""
-    n = axis.A.shape[0]
+    n = len(axis.A)
     stacked = z[:, None, None] * np.eye(n) - axis.A
     x = np.linalg.solve(stacked, np.broadcast_to(axis.By, (z.size, n, 1)).astype(complex))
     return -(np.einsum("in,knj->k", axis.C, x) + axis.Dy)
@@ -135,7 +136,7 @@ def closed_poles(axis: AxisController, plants: Sequence[AxisPlant], extra_delay:
 def delayed_form(plant: AxisPlant, extra_delay: int = 0) -> tuple[Matrix, Vector, Vector]:
     """Return A, B, C of the plant with its delay as states: the inputs that are on their way, oldest first."""
     A, B, C = plant.observable_form()
-    n, d = A.shape[0], plant.delay + extra_delay
+    n, d = len(A), plant.delay + extra_delay
     if d == 0:
         return A, B, C
     whole, entry = np.zeros((n + d, n + d)), np.zeros(n + d)
@@ -263,7 +264,7 @@ def least_rise(plant: AxisPlant, test: StepAndLoad, size: float | None = None) -
 
     dt = plant.sample_time
     rows = math.ceil(_RISE_WINDOW_RATIO * max(plant.time_constant, test.position_limit / test.slew_limit * dt) / dt)
-    u = np.minimum(test.slew_limit * np.arange(1, rows + 1), test.position_limit)
+    u = np.minimum(test.slew_limit * (np.arange(rows) + 1), test.position_limit)
     y = np.asarray(lfilter(np.append(0.0, plant.numerator), plant.denominator, u)) * math.copysign(
         1.0, plant.static_gain
     )
