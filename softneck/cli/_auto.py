@@ -70,25 +70,34 @@ def identify_auto(
     facts = _facts(choice, path)
     if html is not None:
         plots.write_page(html, _page(choice, facts), force=force)
-    judged = choice.chosen.judged
-    why = None if judged is None else useless(judged)
     if as_json:
         kept = {f"{name}_model": str(file) if file in saved else None for name, file in beside.items()}
         print_json({**facts, **kept})
-        _refuse_useless(path, why, judged)
+        _refuse_useless(path, choice)
         return
     print_table(_title(parts[0].robot), _TABLE_HEAD, _rows(choice))
     click.echo(f"{choice.why}\n{path}\n{models[0].summary()}")
     for remark in [*said, *choice.remarks]:
         note(remark)
-    _refuse_useless(path, why, judged)
+    _refuse_useless(path, choice)
 
 
-def _refuse_useless(path: Path, why: str | None, judged: identification.Validation | None) -> None:
-    """Raise CheckFailedError where the best of all kinds is no model."""
-    if why is not None:
-        advice = (judged and left_out(judged)) or "`softneck info REC` says what it lacks."
+def _refuse_useless(path: Path, choice: identification.Choice) -> None:
+    """Raise CheckFailedError where the chosen kind is no model of the rows held out."""
+    judged = choice.chosen.judged
+    why = None if judged is None else useless(judged)
+    if judged is None or why is None:
+        return
+    advice = left_out(judged) or "`softneck info REC` says what it lacks."
+    # Kinds rank by their worst motion: another may fit the rows held out, and fail elsewhere.
+    fitting = [one for one in choice.ranking if one.judged is not None and useless(one.judged) is None]
+    if not fitting:
         raise CheckFailedError(f"{path}: no kind is a model of the rows held out: {why}. {advice}")
+    best = max(fitting, key=lambda one: one.hold_out_fit)
+    raise CheckFailedError(
+        f"{path}: {choice.chosen.kind}, the best by its worst test, is no model of the rows held out: {why}. "
+        f"{best.kind} fits them {percent(best.hold_out_fit)} %, but {percent(best.fit)} % on {best.worst}. {advice}"
+    )
 
 
 def _model(choice: identification.Choice) -> identification.Model:

@@ -50,6 +50,7 @@ from .models._validity import find_farthest_motor as find_farthest_motor
 from .models._validity import low_pass_motors as low_pass_motors
 from .models._validity import with_tolerance as with_tolerance
 from .selection._auto import COLD as COLD
+from .selection._auto import EXAM as EXAM
 from .selection._auto import KindTrial as KindTrial
 from .selection._auto import best_others as best_others
 from .selection._examination import HOLD_OUT as HOLD_OUT

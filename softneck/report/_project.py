@@ -420,7 +420,10 @@ def _certificates(project: Project) -> Section:
     head = ["certificate", "of", "requirements", "files changed since", "verdict"]
     tables = [Table("Certificates", head, rows, text=2)]
     if details:
-        tables.append(Table("Requirements", ["certificate", "metric", "value", "limit", "verdict"], details, text=2))
+        of = "verify: the worst of all its plants, steps and directions; simulate: its one loop"
+        tables.append(
+            Table(f"Requirements ({of})", ["certificate", "metric", "value", "limit", "verdict"], details, text=2)
+        )
     return Section("Verification", tables=tables)
 
 
@@ -474,7 +477,14 @@ def _loops(project: Project) -> Section:
             f"largest set-point [{robot.motors.unit}]"]  # fmt: skip
     tables = [Table(f"Loops, {'/'.join(robot.outputs.names)}", head, metrics)]
     if limits:
-        tables.append(Table("Limits", ["loop", "metric", "value", "limit", "verdict"], limits, text=2))
+        tables.append(
+            Table(
+                "Limits, each of the one plant and reference of its loop",
+                ["loop", "metric", "value", "limit", "verdict"],
+                limits,
+                text=2,
+            )
+        )
     return Section("Loops", tables=tables, charts=charts, method=["Simulated for this page."])
 
 

@@ -20,6 +20,7 @@ from softneck.plots import GREY, Chart, Curve, Panel, Section, Table, cell, curv
 from softneck.tuning import curve_times
 from softneck.verification import (
     certificate_decision,
+    has_drives,
     metric_title,
     nominal_plants,
     sources_of,
@@ -28,7 +29,7 @@ from softneck.verification import (
     write_linear,
 )
 
-from ._tuner import tuner_page
+from ._tuner import faster_values, faster_words, tuner_page
 
 if TYPE_CHECKING:
     from softneck.tuning import Candidate, Tuned
@@ -86,6 +87,7 @@ def tuned_values(found: Tuned, path: Path) -> dict[str, Any]:
         "dropped": dict(found.dropped),
         "verdicts": _verdict_rows(found),
         "judged_elsewhere": found.judged_elsewhere(),
+        "faster": faster_values(found),
         "decision": tune_decision(found),
     }  # fmt: skip
 
@@ -182,10 +184,13 @@ def tune_page(found: Tuned) -> str:
 
 def tune_decision(found: Tuned, *, tuner: str | None = TUNER) -> str:
     """Return the decision of `tune`, from the verdicts of its JSON; `tuner`: the page that it names, if any."""
+    robot = found.task.robot
     one = {"file": CERTIFICATE, "controller": BEST, "kind": found.best.kind, "holds": found.holds,
+           "drives": has_drives((robot.motors.unit, robot.outputs.unit)),
            **verdict_values(_verdict_rows(found))}  # fmt: skip
     said = certificate_decision(one, tuner=tuner)
-    return f"{said} {_loosened_words(found)}" if found.holds and found.loosened else said
+    said = f"{said} {_loosened_words(found)}" if found.holds and found.loosened else said
+    return said if tuner is None else f"{said} {faster_words(faster_values(found), tuner)}".rstrip()
 
 
 def _loosened_words(found: Tuned) -> str:
@@ -289,7 +294,10 @@ def _result(found: Tuned, steps: Chart) -> Section:
     ]
     text += [f"{kind} was left out: {why}" for kind, why in found.dropped.items()]
     rows = requirement_rows(found)
-    tables = [Table("Requirements", ["metric", "bound", "limit", "value", "verdict"], [row[:5] for row in rows])]
+    evidence = found.verification.evidence
+    of = f"{len(evidence.plants)} linear plants and {len(evidence.necks)} simulated loops"
+    caption = f"Requirements, each at its worst over the {of} of the certificate, or over those of the search"
+    tables = [Table(caption, ["metric", "bound", "limit", "value", "verdict"], [row[:5] for row in rows])]
     text += tune_notes(found)
     # A budget that ended before any loop leaves no step to draw.
     charts = [steps] if any(panel.curves for panel in steps.panels) else []
@@ -322,9 +330,20 @@ def _front(found: Tuned) -> Section:
         for item in found.front[:_MAX_FRONT_ROWS]
     ]  # fmt: skip
     more = len(found.front) - _MAX_FRONT_ROWS
-    text = [f"{len(found.front)} candidates that none beats in every objective; all are in pareto.csv."]
+    text = [
+        f"{len(found.front)} candidates that none beats in every objective; all are in pareto.csv.",
+        f"Each value is the worst of the loops of the search alone ({_plants_of_search(found)}); the certificate, "
+        "above, has more plants.",
+    ]
     text += [f"The first {_MAX_FRONT_ROWS} by {found.objectives[0]}."] if more > 0 else []
     return Section("Pareto front", text=text, tables=[Table("", ["kind", *found.objectives, "settings"], rows)])
+
+
+def _plants_of_search(found: Tuned) -> str:
+    """Return the plants and the steps of the search's loops in words."""
+    robot, size = found.task.robot, float(found.task.asked.certificate.sim["size_deg"])
+    plants = "all simulation models and payloads" if found.task.own else "all linear plants"
+    return f"{plants}, steps of up to {size:.4g} {robot.outputs.display_unit}"
 
 
 def _label(found: Tuned, item: Candidate) -> str:

@@ -54,7 +54,7 @@ class Tuner {
     const most = 0.8 * one.x, fast = this.candidates.filter(other => other.x <= most);
     const goal = `20 % faster (${this.x_name} at most ${united(most, this.x_unit)})`;
     if (!fast.length) return `${goal}: no judged candidate is.`;
-    const far = other => this.broken(other).length * 1e3 + (other.speed - one.speed) ** 2 + (other.caution - one.caution) ** 2;
+    const far = other => this.broken(other).length * 1e6 + (other.speed - one.speed) ** 2 + (other.caution - one.caution) ** 2;
     const other = fast.reduce((a, b) => far(b) < far(a) ? b : a);
     const worse = this.requirements.filter((item, k) => {
       const [a, b] = [one.values[k], other.values[k]];

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from markupsafe import escape
@@ -22,6 +22,7 @@ from softneck.verification import metric_title
 if TYPE_CHECKING:
     from softneck.robot import Robot
     from softneck.tuning import Candidate, Tuned
+    from softneck.verification import Requirement
 
 _SIGNS = {"min": ">=", "max": "<=", "below": "<"}
 # Metrics of the sliders, the first that all candidates have: speed, and caution.
@@ -73,6 +74,52 @@ def tuner_page(found: Tuned, folder: Path, plants: Mapping[str, Path], *, certif
 
 def tuner_values(found: Tuned, folder: Path, plants: Mapping[str, Path], certified: str) -> dict[str, Any]:
     """Return the JSON values of the page; infinite numbers as text, values that were not computed as None."""
+    shown = _judged(found)
+    items, task, bounds, x, y = found.candidates, found.task, shown.bounds, shown.x, shown.y
+    metrics = [bound.metric for bound in bounds]
+    candidates = []
+    for number, k in enumerate(shown.order, start=1):
+        item, own = items[k], folder / f"{items[k].kind}-{number}.npz"
+        broken = item.ratios(bounds, tested=task.tested)
+        candidates.append({
+            "number": number, "kind": item.kind, "settings": _settings_text(item.settings), "best": item is found.best,
+            "values": [_number(item.metrics.get(metric)) for metric in metrics],
+            "unproven": [_unproven(item, bound, broken) for bound in bounds],
+            "x": _number(item.metrics[x]), "y": _number(item.metrics[y]), "speed": shown.speed[k],
+            "caution": shown.caution[k], "curves": dict(item.curves), "file": str(own),
+            "command": design_command(found, item, own, folder, plants),
+        })  # fmt: skip
+    return {
+        "candidates": candidates,
+        "requirements": [{"metric": b.metric, "name": _name(b.metric), "unit": _unit(b.metric, task.robot),
+                          "bound": b.bound, "limit": b.limit}
+                         for b in bounds],
+        "x_name": _name(x), "y_name": _name(y), "x_limit": _index(metrics, x), "y_limit": _index(metrics, y),
+        "x_unit": _unit(x, task.robot), "y_unit": _unit(y, task.robot),
+        "overshoot": _index(metrics, f"{x.partition('.')[0]}.overshoot_pct"),
+        "elsewhere": sorted({_name(b.metric) for b in task.bounds if b not in bounds}),
+        "time": [float(f"{t:.4g}") for t in curve_times(task)], "angles": circle_angles().tolist(),
+        "best_file": str(folder / "best.npz"), "certified": certified,
+        "names": {**_NAMES, "motors": {}},
+    }  # fmt: skip
+
+
+class _Judged(NamedTuple):
+    """What the page shows of all candidates.
+
+    `bounds`: requirements that the search computed. `x`, `y`: metrics of speed and caution. `speed`, `caution`: place
+    of each candidate, 0 to 100. `order`: of the candidates, the fastest first.
+    """
+
+    bounds: list[Requirement]
+    x: str
+    y: str
+    speed: list[float]
+    caution: list[float]
+    order: list[int]
+
+
+def _judged(found: Tuned) -> _Judged:
     items, task = found.candidates, found.task
     # Of requirements that the search did not compute for any candidate the certificate decides.
     known = objectives(items)
@@ -87,31 +134,63 @@ def tuner_values(found: Tuned, folder: Path, plants: Mapping[str, Path], certifi
     speed = _places([item.metrics[x] for item in items])
     caution = _places([-item.metrics[y] if larger else item.metrics[y] for item in items])
     order = sorted(range(len(items)), key=lambda k: items[k].metrics[x])
-    metrics = [bound.metric for bound in bounds]
-    candidates = []
-    for number, k in enumerate(order, start=1):
-        item, own = items[k], folder / f"{items[k].kind}-{number}.npz"
-        broken = item.ratios(bounds, tested=task.tested)
-        candidates.append({
-            "number": number, "kind": item.kind, "settings": _settings_text(item.settings), "best": item is found.best,
-            "values": [_number(item.metrics.get(metric)) for metric in metrics],
-            "unproven": [_unproven(item, bound, broken) for bound in bounds],
-            "x": item.metrics[x], "y": item.metrics[y], "speed": speed[k], "caution": caution[k],
-            "curves": dict(item.curves), "file": str(own), "command": design_command(found, item, own, folder, plants),
-        })  # fmt: skip
-    return {
-        "candidates": [one | {"x": _number(one["x"]), "y": _number(one["y"])} for one in candidates],
-        "requirements": [{"metric": b.metric, "name": _name(b.metric), "unit": _unit(b.metric, task.robot),
-                          "bound": b.bound, "limit": b.limit}
-                         for b in bounds],
-        "x_name": _name(x), "y_name": _name(y), "x_limit": _index(metrics, x), "y_limit": _index(metrics, y),
-        "x_unit": _unit(x, task.robot), "y_unit": _unit(y, task.robot),
-        "overshoot": _index(metrics, f"{x.partition('.')[0]}.overshoot_pct"),
-        "elsewhere": sorted({_name(b.metric) for b in task.bounds if b not in bounds}),
-        "time": [float(f"{t:.4g}") for t in curve_times(task)], "angles": circle_angles().tolist(),
-        "best_file": str(folder / "best.npz"), "certified": certified,
-        "names": {**_NAMES, "motors": {}},
-    }  # fmt: skip
+    return _Judged(bounds, x, y, speed, caution, order)
+
+
+_FASTER_PCT = 20.0
+# Costs in the sentence, those that break a requirement first; the page lists more.
+_MAX_COSTS = 4
+
+
+def faster_values(found: Tuned) -> dict[str, Any] | None:
+    """Return the JSON values of what it costs to be 20 % faster than the best; None if it has no finite speed.
+
+    `candidate`: number on the tuner page of that which breaks least, of equals the nearest, or None. `costs`: metric ->
+    values of the best and of it, where worse by more than a twentieth. `breaks`: the requirements that it breaks.
+    """
+    items, task, shown = found.candidates, found.task, _judged(found)
+    best = next((k for k, item in enumerate(items) if item is found.best), None)
+    if best is None or not math.isfinite(items[best].metrics[shown.x]):
+        return None
+    most = (1.0 - _FASTER_PCT / 100.0) * items[best].metrics[shown.x]
+    said = {"faster_pct": _FASTER_PCT, "metric": shown.x, "unit": _unit(shown.x, task.robot), "at_most": most}
+
+    def far(k: int) -> tuple[int, float]:
+        places = ((each[k] - each[best]) ** 2 for each in (shown.speed, shown.caution))
+        return len(broken(k)), sum(places)
+
+    def broken(k: int) -> list[str]:
+        return [metric for metric, ratio in items[k].ratios(shown.bounds, tested=task.tested).items() if ratio > 1.0]
+
+    fast = [k for k in shown.order if items[k].metrics[shown.x] <= most]
+    if not fast:
+        return {**said, "candidate": None}
+    other, costs = min(fast, key=far), {}
+    for bound in shown.bounds:
+        a, b = (items[k].metrics.get(bound.metric) for k in (best, other))
+        if a is not None and b is not None and (b < 0.95 * a if bound.bound == "min" else b > 1.05 * a):
+            costs[bound.metric] = {"best": _number(a), "faster": _number(b), "unit": _unit(bound.metric, task.robot)}
+    return {**said, "candidate": shown.order.index(other) + 1, "kind": items[other].kind,
+            "value": items[other].metrics[shown.x], "costs": costs, "breaks": broken(other)}  # fmt: skip
+
+
+def faster_words(one: Mapping[str, Any] | None, tuner: str) -> str:
+    """Return the sentence on what it costs to be 20 % faster, of `faster_values`; `tuner`: its page."""
+    if one is None:
+        return ""
+    goal = f"{one['faster_pct']:g} % faster ({_name(one['metric'])} at most {one['at_most']:.3g} {one['unit']})"
+    if one["candidate"] is None:
+        return f"{goal}: no judged candidate is."
+    ordered = sorted(one["costs"].items(), key=lambda pair: pair[0] not in one["breaks"])
+    costs = [f"{_name(metric)} {cell(each['best'], '.3g')} -> {cell(each['faster'], '.3g')} {each['unit']}".rstrip()
+             for metric, each in ordered]  # fmt: skip
+    costs[_MAX_COSTS:] = [f"{len(costs) - _MAX_COSTS} more"] if len(costs) > _MAX_COSTS else []
+    broken = len(one["breaks"])
+    ends = f"breaks {broken} of the requirements" if broken else "keeps all computed requirements"
+    return (
+        f"{goal}: candidate {one['candidate']} of {tuner} ({one['kind']}, {one['value']:.3g} {one['unit']}) costs "
+        f"{'; '.join(costs) or 'nothing that is required'}, and {ends}."
+    )
 
 
 def design_command(found: Tuned, item: Candidate, target: Path, folder: Path, plants: Mapping[str, Path]) -> str:
@@ -180,7 +259,7 @@ def _table(requirements: Sequence[Mapping[str, Any]]) -> str:
         for k, item in enumerate(requirements)
     ]
     head = "".join(f"<th{' class=text' if k == 0 else ''}>{text}</th>" for k, text in
-                   enumerate(("requirement", "worst value", "limit", "verdict")))  # fmt: skip
+                   enumerate(("requirement", "worst value in the search", "limit", "verdict")))  # fmt: skip
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
 
 

@@ -12,6 +12,7 @@ from ._worst import linear_plant as linear_plant
 # Shared with other subpackages of softneck; not in the reference, and may change.
 from ._decision import certificate_decision as certificate_decision
 from ._decision import certificate_values as certificate_values
+from ._decision import has_drives as has_drives
 from ._decision import metric_words as metric_words
 from ._decision import verdict_values as verdict_values
 from ._experiments import crossing_values as crossing_values

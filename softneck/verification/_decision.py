@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from softneck.core import SettingsError, required_rows
+from softneck.core import SettingsError, required_rows, to_si
 from softneck.plots import cell
 
 from ._metrics import MARGIN_GROUPS, metric_title
@@ -31,7 +31,13 @@ def certificate_values(file: str, content: Values) -> dict[str, Any]:
     controller = content.get("files", {}).get("controller", {}).get("path", "")
     return {"file": file, "of": str(content.get("certificate")), "controller": str(controller),
             "kind": str(content.get("controller_kind", "")), **verdict_values(rows),
+            "drives": has_drives(content.get("units", ())),
             "holds": bool(content.get("holds")) and bool(rows)}  # fmt: skip
+
+
+def has_drives(units: Sequence[str]) -> bool:
+    """Return whether `softneck drives` runs a robot whose motors and outputs have these units: all are angles."""
+    return all(to_si(str(unit))[1] == "rad" for unit in units)
 
 
 def verdict_values(rows: Sequence[Values]) -> dict[str, Any]:
@@ -63,8 +69,11 @@ def certificate_decision(one: Values, *, tuner: str | None = None) -> str:
         # Slack is known of plants with tensions alone, and other robots have no tendons.
         if any(metric.startswith(("sim.", "track.")) and metric != "sim.slack_s" for metric in undecided):
             way = "verify it over a simulation model of this robot too, or over a family with draws"
-        else:
+        elif one["drives"]:
             way = "run it on drives with that certificate (`softneck drives --help`)"
+        else:
+            file = one["controller"] or "CONTROLLER"
+            way = f"export it for your own computer (`softneck fmu {file} --backend compiled`: an FMU, C inside)"
         more = f", or {trade}" if trade else ""
         return f"{name} holds {holds} requirements of {one['file']}{rest}. Next: {way}{more}."
     if not one["failed"]:

@@ -220,10 +220,15 @@ def verification_page(found: Verification, controller: str, certificate: str = "
         "The controller's own runtime with all its limits, against every plant with its delay and noisy outputs: a "
         f"step of {first}{each}; half way a load is added to the plant's input."
     ]
-    sections.append(Section("Steps", tables=[_spread(found, "step")], method=text))
+    size, unit = found.requirements.step["size_deg"], scale.robot.outputs.display_unit
+    where = f"Steps of {size:.4g} {unit} on all {len(evidence.stepped)} linear plants"
+    sections.append(Section("Steps", tables=[_spread(found, "step", where)], method=text))
     if evidence.necks:
         charts = [neck_chart(evidence, scale)] if any(run.result is not None for run in evidence.necks) else []
-        sections.append(Section("Simulated loops", tables=[_spread(found, "sim"), _runs_table(found)], charts=charts))
+        size = found.requirements.sim["size_deg"]
+        where = f"Steps of {size:.4g} {unit} of all simulation models and draws, in all directions, with all payloads"
+        tables = [_spread(found, "sim", where), _runs_table(found)]
+        sections.append(Section("Simulated loops", tables=tables, charts=charts))
     sections.append(_plants_section(found))
     words = "holds" if found.holds else "does not hold"
     return page(
@@ -275,14 +280,14 @@ def _margin_table(part: LinearEvidence, *, drawn: bool) -> Table:
     return Table(title, ["margin", "nominal", "median", "least", "largest"], rows)
 
 
-def _spread(found: Verification, group: str) -> Table:
+def _spread(found: Verification, group: str, caption: str) -> Table:
     rows = []
     for name, values in found.evidence.metrics.items():
         if name.startswith(f"{group}."):
             v = values.values
             worst = values.describe(int(np.argmax(v)))["name"]
             rows.append([name.partition(".")[2], *(cell(float(x)) for x in (v[0], np.median(v), v.max())), worst])
-    return Table("Over all of them", ["metric", "nominal", "median", "worst", "worst plant"], rows)
+    return Table(caption, ["metric", "nominal", "median", "worst", "worst plant"], rows)
 
 
 def _runs_table(found: Verification) -> Table:
@@ -290,7 +295,7 @@ def _runs_table(found: Verification) -> Table:
     names = list(runs[0].metrics)
     rows = [[run.name, *(cell(run.metrics[name]) for name in names)] for run in runs]
     shown = [found.requirements.scale.name_of(f"sim.{name}").partition(".")[2] for name in names]
-    return Table("Each loop", ["plant, payload, direction", *shown], rows)
+    return Table("Each loop over a simulation model, in one direction", ["plant, payload, direction", *shown], rows)
 
 
 def _plants_section(found: Verification) -> Section:

@@ -141,6 +141,7 @@ class Verification(ReprMixin):
             "extra_delay_samples": self.controller.extra,
             "sample_time_s": self.controller.block.sample_time,
             "controller_kind": self.controller.block.kind,
+            "units": [robot.motors.unit, robot.outputs.unit],
             "observer": self.observer,
             "plants": {
                 "count": len(evidence.plants),

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import softneck
-from softneck.core import SettingsError, load, read_archive
+from softneck.cli._auto import _refuse_useless
+from softneck.core import CheckFailedError, SettingsError, load, read_archive
 from softneck.identification._identify import _split_for_choice
 from softneck.identification.selection import _auto
 from softneck.signals import write_recording
@@ -105,6 +108,24 @@ def test_auto_ends_with_exit_code_1_where_no_kind_makes_a_model(
         assert said.code == 1
         assert "no kind is a model of the rows held out: its simulation diverges" in said.err.splitlines()[-1]
     assert json.loads(said.out)["model"] == "best1.npz"
+
+
+def test_that_no_kind_is_a_model_is_said_only_where_none_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("softneck.cli._auto.useless", lambda judged: None if judged == "good" else "its fit is -3 %")
+    monkeypatch.setattr("softneck.cli._auto.left_out", lambda _: "")
+
+    def trial(kind: str, judged: str | None, fits: tuple[float, float]) -> Any:
+        return SimpleNamespace(kind=kind, judged=judged, hold_out_fit=fits[0], fit=min(fits), worst="largest motions")
+
+    ranking = [trial("oe", "bad", (-3.0, 9.0)), trial("nn", None, (0.0, 0.0)), trial("rls", "good", (81.0, -20.0))]
+    choice: Any = SimpleNamespace(chosen=ranking[0], ranking=ranking)
+    with pytest.raises(CheckFailedError, match="oe, the best by its worst test, is no model of the rows") as said:
+        _refuse_useless(Path("m.npz"), choice)
+    assert "rls fits them 81.0 %, but -20.0 % on largest motions." in str(said.value)
+    alone: Any = SimpleNamespace(chosen=ranking[0], ranking=ranking[:2])
+    with pytest.raises(CheckFailedError, match="no kind is a model of the rows held out: its fit"):
+        _refuse_useless(Path("m.npz"), alone)
+    _refuse_useless(Path("m.npz"), SimpleNamespace(chosen=ranking[2], ranking=ranking))  # type: ignore[arg-type]
 
 
 def test_auto_prints_one_json_object_and_holds_out_the_last_of_several(call: Call, recording: Path) -> None:

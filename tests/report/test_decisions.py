@@ -169,6 +169,13 @@ def test_a_project_decides_on_model_controller_and_next_step() -> None:
         "tune/best.npz (hinf) holds all 1 requirements of best.certificate.json. Next: run it on drives with that "
         "certificate (`softneck drives --help`), or open tune/tuner.html to trade speed for caution."
     )
+    # A robot in pressures has no CANopen drives: its controller is exported.
+    pressures = {**certificate(0), "units": ["kPa", "deg"]}
+    said = project_decision([], [certificate_values("c.json", pressures)], tuner=None)
+    way = "export it for your own computer (`softneck fmu tune/best.npz --backend compiled`: an FMU, C inside)."
+    assert said.endswith(f"Next: {way}")
+    turns = certificate_values("c.json", {**certificate(0), "units": ["rad", "deg"]})
+    assert project_decision([], [turns], tuner=None).endswith("(`softneck drives --help`).")
     # What does not decide is not held; loops over no model of the robot are not enough for drives.
     for metric, way in (("sim.rise_s", "Next: verify it over a simulation model"), ("sim.slack_s", "Next: run"),
                         ("axes.sensitivity", "Next: run")):  # fmt: skip

@@ -17,6 +17,7 @@ import pytest
 
 import softneck
 from softneck.cli._main import run
+from softneck.plots import cell
 from softneck.report import write_tuned
 from softneck.tuning import Tuned, tune
 
@@ -200,6 +201,38 @@ def test_what_20_percent_more_speed_costs_is_another_candidate(made: Made, view:
     for k, one in enumerate(made.data["requirements"]):
         if f"{one['name']} " in said and f"instead of {digits(float(now['values'][k]))}" in said:
             assert f"{one['name']} {digits(float(other['values'][k]))}" in said
+
+
+def test_the_decision_prices_20_percent_more_speed_as_the_page_does(made: Made, view: Shown) -> None:
+    one, said, candidates = made.values["faster"], made.values["decision"], made.data["candidates"]
+    page, best = view.page.locator("#cost").inner_text(), next(each for each in candidates if each["best"])
+    assert one["at_most"] == pytest.approx(0.8 * best["x"], rel=1e-12)
+    assert f"20 % faster ({made.data['x_name']} at most {one['at_most']:.3g} s): " in said
+    if one["candidate"] is None:
+        assert min(each["x"] for each in candidates) > one["at_most"]
+        assert said.endswith("no judged candidate is.")
+        assert "no judged candidate is" in page
+        return
+    other = candidates[one["candidate"] - 1]
+    assert other["x"] == one["value"] <= one["at_most"]
+    assert f"candidate {one['candidate']} of tuner.html (pi, {one['value']:.3g} s) costs " in said
+    assert f"candidate {one['candidate']} (pi, " in page
+    told = 0
+    for k, item in enumerate(made.data["requirements"]):
+        (before, after), cost = (each["values"][k] for each in (best, other)), one["costs"].get(item["metric"])
+        if cost is None:
+            assert None in (before, after) or (
+                float(after) >= 0.95 * float(before) if item["bound"] == "min" else float(after) <= 1.05 * float(before)
+            )
+        else:
+            assert (cost["best"], cost["faster"]) == (before, after)
+            here = f"{item['name']} {cell(before, '.3g')} -> {cell(after, '.3g')}" in said
+            assert here or item["metric"] not in one["breaks"]
+            told += here
+    assert told == min(len(one["costs"]), 4)
+    verdicts = view.page.evaluate(f"tuner.verdicts(tuner.candidates[{one['candidate'] - 1}])")
+    breaks = [item["metric"] for item, word in zip(made.data["requirements"], verdicts, strict=True) if word == "fails"]
+    assert set(breaks) == set(one["breaks"])
 
 
 def test_keys_move_the_sliders(made: Made, view: Shown) -> None:

@@ -153,6 +153,12 @@ def _explain_guarded(best: KindTrial, chosen: KindTrial) -> str:
     )
 
 
+def _explain_agreement(ranking: Sequence[KindTrial]) -> str:
+    """Return what the test "agreement" is, where it was made."""
+    made = any(EXAM in one.scores for one in ranking)
+    return f" {EXAM.capitalize()}: fit to the median of all kinds on motions that nobody recorded." if made else ""
+
+
 def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[str, ...]:
     """Return the warnings on a ranking."""
     remarks = []
@@ -268,7 +274,7 @@ def choose(
     progress(1.0, f"chosen: {chosen.kind}")
     alike = [one for one in ranking if one.fit > best.fit - ALIKE and one not in (best, chosen)]
     wary = (*poor_excitation(train), *_remarks(ranking, other_excitation))
-    why = _explain_choice(best, alike) + _explain_guarded(best, chosen)
+    why = _explain_choice(best, alike) + _explain_guarded(best, chosen) + _explain_agreement(ranking)
     return Choice(ranking, chosen, why, wary, other_excitation or other_motion(train))
 
 

@@ -295,3 +295,10 @@ def test_the_choice_says_fit_and_size_of_the_chosen_and_of_those_alike() -> None
     assert _explain_choice(alone, beside) == (
         f"{said} ensemble reaches 69.4 % with 10,481. Within 0.5 points the kind with the fewest parameters is chosen."
     )
+
+
+@pytest.mark.parametrize("test", [_auto.EXAM, "largest motions"])
+def test_agreement_is_explained_where_it_was_computed(test: str) -> None:
+    one = KindTrial("rls", 0.0, left_out={test: 40.0, HOLD_OUT: 90.0})
+    said = " Agreement: fit to the median of all kinds on motions that nobody recorded."
+    assert _auto._explain_agreement((KindTrial("nn", 0.0), one)) == (said if test == _auto.EXAM else "")
