@@ -41,6 +41,8 @@ from ._certificate import required_rows as required_rows
 from ._certificate import sim_name as sim_name
 from ._checks import finite_matrix as finite_matrix
 from ._checks import finite_vector as finite_vector
+from ._content import compute_once as compute_once
+from ._content import content_digest as content_digest
 from ._display import ReprMixin as ReprMixin
 from ._display import percent as percent
 from ._display import shown_progress as shown_progress

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Progress, Vector
+from softneck.core import DataError, Progress, Vector, compute_once
 from softneck.estimation import directions_of
 from softneck.identification import Draws
 from softneck.loop import BlockPart, Loop, LoopResult, MotorFault, RobotReference, error_unit, run_loop
@@ -144,8 +144,24 @@ def run_drawn(
 
     Steps of every required direction at the lightest and the heaviest payload, with the disturbance of the draws, the
     sensor's noise, and a load after the step; and each required margin at three amplitudes. Of the draws that swing
-    most there the margin itself is bisected. `search` takes the draws that a search may see, at most `count`.
+    most there the margin itself is bisected. `search` takes the draws that a search may see, at most `count`. Equal
+    loops are run once in a process, as those of a controller that `tune` has verified.
     """
+    limits = [(b.metric, b.bound, b.limit) for b in asked.bounds if b.metric.startswith("sim.") or b.metric in _MARGINS]
+
+    def compute() -> Drawn:
+        return _run_all(name, draws, controller, asked, order, observer, attempt, progress, count, search)
+
+    found = compute_once(
+        compute, name, draws, controller, asked.tables, limits, order, observer, attempt, count, search
+    )  # fmt: skip
+    return replace(found, unreached=_unreached(draws, asked))
+
+
+def _run_all(
+    name: str, draws: Draws, controller: Block, asked: Requirements, order: str, observer: Block | None, attempt: int,
+    progress: Progress, count: int | None, search: bool,
+) -> Drawn:  # fmt: skip
     models = draws.for_search(count or len(draws.for_search())) if search else draws.for_certificate(attempt)
     plants = [make_simulation_model(model, f"draw {k + 1} of {name}", asked.robot) for k, model in enumerate(models)]
     inverse = asked.robot.redefinition(directions_of(draws.model))[1]
@@ -187,7 +203,7 @@ def run_drawn(
             conditions.setdefault(metric, []).append(_margin_facts(item, plants[item.number].name, asked))
     return Drawn(
         name, draws, attempt, len(plants), {metric: np.array(found) for metric, found in values.items()}, conditions,
-        tuple(sorted(failed)), _unreached(draws, asked),
+        tuple(sorted(failed)),
     )  # fmt: skip
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from softneck.core import Progress, ReprMixin, Vector
+from softneck.core import Progress, ReprMixin, Vector, compute_once
 from softneck.loop import error_unit
 from softneck.runtime import Block
 
@@ -105,37 +105,23 @@ def gather(
     `attempt`: whose draws are taken of families that have them.
     """
     drawn = draws_of(families)
-    sources, seed = list(necks), int(asked.sampling["seed"])
-    base = all_plants(sources, int(asked.sampling["plants"]), seed)
-    plants = base.later(controller.extra)
-    w = frequency_grid(base.sample_time, asked.scale.time)
-    linear = []
-    for number, (name, law) in enumerate(controller.laws.items()):
-        progress(0.5 * number / len(controller.laws), "margins" + (f" at {name}" if name else ""))
-        linear.append(_linear(name, law, plants, sources, controller.extra, asked))
-    progress(0.5, "steps against every plant")
-    stepped = join([plants, *(part.plants.take(np.arange(len(plants), len(part.plants))) for part in linear)])
-    test, weights = asked.step_test(seed), sources[0].weights
-    steps = run_steps(stepped, controller.block, test, robot=controller.robot, weights=weights)
-    why = why_no_virtual_plant(controller.robot, asked)
-    runs = run_loops(
-        controller.block, asked, order=controller.order, observer=observer, seed=seed,
-        progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
-    ) if own or not (why or drawn) else []  # fmt: skip
-    loops = loops_under_test(controller.block, own, asked, order=controller.order, observer=observer)
+
+    def compute() -> Evidence:
+        return _without_draws(
+            controller, necks, asked, observer=observer, progress=progress, families=families, own=own, overall=overall
+        )
+
     # Margins of single axes are only computed if required.
-    alone = {f"{axis}.{name}" for axis in plants.axes for name in ("gain_margin", "delay_margin_ms")}
+    alone = {f"{axis}.{name}" for axis in controller.robot.outputs.names for name in ("gain_margin", "delay_margin_ms")}
     overall = all(item.metric not in alone for item in asked.bounds)
-    late = lambda done, text: progress(0.8 + 0.2 * done, text)  # noqa: E731
-    found = crossings(loops, overall=overall, progress=late) if loops else []
-    steep = float(asked.uncertainty["rolloff_db_per_decade"])
-    laws = controller.laws.values()
-    tested = [item for law in laws for item in data_margins(families, law, plants.axes, controller.extra, steep)]
-    # A built-in plant does not count unless the user gives its file.
-    foreign = not (own or drawn or asked.sim["decides"] or preset_of(asked).endswith(".toml"))
-    evidence = Evidence(plants, w, linear, steps, stepped, runs, foreign=foreign, tested=tested, crossings=found)
+    made_of = (controller, necks, asked.tables, observer, families, [(m.name, m.thing) for m in own], overall)
+    # The built-in plant may be a file, which may have changed.
+    found = compute_once(compute, *made_of) if own or drawn else compute()
+    evidence = replace(found, metrics={}, not_computed={}, drawn=[])
+    why = why_no_virtual_plant(controller.robot, asked)
     evidence.not_computed.update({"sim": why} if why and not own else judged_elsewhere(own, asked))
     _fill_metrics(evidence, controller, asked, observer is not None)
+    late = lambda done, text: progress(0.8 + 0.2 * done, text)  # noqa: E731
     for name, draws in drawn.items():
         evidence.drawn.append(run_drawn(
             name, draws, controller.block, asked, order=controller.order, observer=observer, attempt=attempt,
@@ -148,6 +134,38 @@ def gather(
     _add_drawn(evidence, {name for item in evidence.drawn for name in item.values})
     progress(1.0, "done")
     return evidence
+
+
+def _without_draws(
+    controller: ControllerUnderTest, necks: Sequence[PlantSource], asked: Requirements, *, observer: Block | None,
+    progress: Progress, families: Mapping[str, Any], own: Sequence[SimulationModel], overall: bool,
+) -> Evidence:  # fmt: skip
+    """Compute what neither limits nor draws change; `overall`: no margin of a single axis is required."""
+    sources, seed, drawn = list(necks), int(asked.sampling["seed"]), draws_of(families)
+    base = all_plants(sources, int(asked.sampling["plants"]), seed)
+    plants = base.later(controller.extra)
+    w = frequency_grid(base.sample_time, asked.scale.time)
+    linear = []
+    for number, (name, law) in enumerate(controller.laws.items()):
+        progress(0.5 * number / len(controller.laws), "margins" + (f" at {name}" if name else ""))
+        linear.append(_linear(name, law, plants, sources, controller.extra, asked))
+    progress(0.5, "steps against every plant")
+    stepped = join([plants, *(part.plants.take(np.arange(len(plants), len(part.plants))) for part in linear)])
+    test, weights = asked.step_test(seed), sources[0].weights
+    steps = run_steps(stepped, controller.block, test, robot=controller.robot, weights=weights)
+    runs = run_loops(
+        controller.block, asked, order=controller.order, observer=observer, seed=seed,
+        progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
+    ) if own or not (why_no_virtual_plant(controller.robot, asked) or drawn) else []  # fmt: skip
+    loops = loops_under_test(controller.block, own, asked, order=controller.order, observer=observer)
+    late = lambda done, text: progress(0.8 + 0.2 * done, text)  # noqa: E731
+    found = crossings(loops, overall=overall, progress=late) if loops else []
+    steep = float(asked.uncertainty["rolloff_db_per_decade"])
+    laws = controller.laws.values()
+    tested = [item for law in laws for item in data_margins(families, law, plants.axes, controller.extra, steep)]
+    # A built-in plant does not count unless the user gives its file.
+    foreign = not (own or drawn or asked.sim["decides"] or preset_of(asked).endswith(".toml"))
+    return Evidence(plants, w, linear, steps, stepped, runs, foreign=foreign, tested=tested, crossings=found)
 
 
 def _linear(

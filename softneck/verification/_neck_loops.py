@@ -41,6 +41,7 @@ class SimulationModel:
     `name`: of its file. `make`: returns a new part, given the seed of its sensor's noise and the loop's sample time
     [s]. `quiet`: as `make`, without noise if the plant can. `payload`: "inputs" or "parameters" that set it, or "".
     `parameters`: of a virtual neck; else None. `conditions`: payload and co-contraction of the training data, if known.
+    `thing`: what it was made of.
     """
 
     name: str
@@ -49,6 +50,7 @@ class SimulationModel:
     payload: str
     parameters: NeckParameters | None = None
     conditions: Mapping[str, list[float]] = field(default_factory=dict)
+    thing: Any = None
 
     def payloads(self, asked: Sequence[float]) -> list[float]:
         """Return the payloads [kg] that stand for those asked: the nearest known ones, and the ends of the recordings.
@@ -117,7 +119,7 @@ def make_simulation_model(thing: Any, name: str, robot: Robot | None = None) -> 
         neck = thing if isinstance(thing, VirtualNeck) else VirtualNeck(thing)
         still = VirtualNeck(neck.parameters.without_noise(), neck.robot)
         return SimulationModel(
-            name=name, payload="inputs", parameters=neck.parameters,
+            name=name, payload="inputs", parameters=neck.parameters, thing=neck,
             make=lambda seed, Ts: BlockPart(neck.block(noise_seed=seed, sample_time=Ts)),
             quiet=lambda Ts: BlockPart(still.block(sample_time=Ts)),
         )  # fmt: skip
@@ -141,7 +143,8 @@ def make_simulation_model(thing: Any, name: str, robot: Robot | None = None) -> 
     taken = {"inputs": part.inputs, "parameters": settable}
     payload = next((how for how, ports in taken.items() if any(port.name == "payload" for port in ports)), "")
     return SimulationModel(
-        name=name, make=lambda _seed, _Ts: make(), quiet=lambda _Ts: make(), payload=payload, conditions=known
+        name=name, make=lambda _seed, _Ts: make(), quiet=lambda _Ts: make(), payload=payload, conditions=known,
+        thing=thing,
     )  # fmt: skip
 
 

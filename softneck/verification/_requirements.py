@@ -190,6 +190,11 @@ class Requirements(ReprMixin):
         """The robot of the controller."""
         return self.scale.robot
 
+    @property
+    def tables(self) -> tuple[Any, ...]:
+        """All that a test needs: no limits, and not which of the values the user stated."""
+        return self.uncertainty, self.sampling, self.step, self.sim, self.scale
+
     def step_test(self, seed: int) -> StepTest:
         """Return the step test on linear plants."""
         load = to_si(self.robot.motors.unit)[0] * float(self.step["load_rad"])

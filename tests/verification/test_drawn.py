@@ -494,6 +494,53 @@ def test_a_draw_fails_by_its_steps_and_by_its_margins(
     assert run_with(monkeypatch, [{}] * 3, margins)[0].failed == (() if bad is None else (bad,))
 
 
+@dataclass(frozen=True)
+class ToldDraws:
+    conditions: dict[str, list[float]]
+    seed: int = 7
+
+    def for_certificate(self, attempt: int) -> list[int]:
+        return [attempt] * 3
+
+
+def test_equal_loops_run_once_and_every_other_attempt_limit_or_draw_runs_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    runs: list[int] = []
+
+    def steps(_: Any, number: int) -> dict[str, list[tuple[float, str]]]:
+        runs.append(number)
+        return {"sim.overshoot_pct": [(3.0, "0 deg")]}
+
+    monkeypatch.setattr(_drawn, "make_simulation_model", lambda _, name, __: SimpleNamespace(name=name))
+    monkeypatch.setattr(_drawn, "_steps", steps)
+    monkeypatch.setattr(_drawn, "_margins", lambda *_: [])
+    monkeypatch.setattr(_drawn, "_amplitudes", lambda *_: (0.1,))
+    monkeypatch.setattr(_drawn, "directions_of", lambda _: None)
+    monkeypatch.setattr(ToldDraws, "model", None, raising=False)
+
+    def run(limit: float = 10.0, attempt: int = 1, seed: int = 7, **more: Any) -> Drawn:
+        asked = make_requirements({"sim": {"decides": True, **more}, "require": {"sim.overshoot_pct": {"max": limit}}})
+        draws: Any = ToldDraws({"motion": [0.4], "payload_kg": [0.0]}, seed)
+        return run_drawn(
+            "once", draws, pi().block(), asked, order="sequential", observer=None, attempt=attempt,
+            progress=lambda *_: None,
+        )  # fmt: skip
+
+    first = run()
+    assert (len(runs), first.failed) == (3, ())
+    again = run()
+    assert (len(runs), again.statement(), again.conditions) == (3, first.statement(), first.conditions)
+    assert run(limit=2.0).failed == (0, 1, 2)
+    assert (run(attempt=2).attempt, run(seed=8).draws.seed) == (2, 8)
+    assert len(runs) == 12
+    # What the user stated changes what is told of equal loops.
+    payloads = make_requirements({}).sim["payloads_kg"]
+    assert "sim" in run(payloads_kg=payloads).unreached
+    assert not again.unreached
+    assert len(runs) == 12
+
+
 def test_each_kind_of_margin_is_bisected_on_the_draws_that_swing_most(monkeypatch: pytest.MonkeyPatch) -> None:
     def of(k: int, kind: str) -> _Margin:
         return replace(margin(Case(kind), 10.0 * k, beyond=float(k)), number=k, metric="axes.gain_margin")
