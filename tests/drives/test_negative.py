@@ -432,11 +432,53 @@ def test_stop_and_reset_write_the_control_word_alone(monkeypatch: pytest.MonkeyP
     assert _stop.reset(link, FILE) == off  # pyright: ignore[reportArgumentType]
     assert [drive.written for drive in drives.values()] == [[(0x6040, 0, word) for word in (0, 0x80, 0)]] * len(drives)
     assert not sent
+    # 20 ms after each word.
+    assert link.now == pytest.approx(len(drives) * 3 * 0.02)
+    link.now = 0.0
     assert _stop.stop(link, FILE) == off  # pyright: ignore[reportArgumentType]
     assert all(drive.written[3:] == [(0x6040, 0, 0)] for drive in drives.values())
     # An expedited download of two bytes: quick stop, twice to each.
     told = bytes([0x2B, 0x40, 0x60, 0, 0x02, 0, 0, 0])
     assert sent == 2 * [Frame(0x600 + node, told) for node in drives]
+    # A quick stop has half a second before the voltage goes.
+    assert link.now == pytest.approx(0.5)
+
+
+def test_a_drive_without_an_answer_is_none_that_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At a stop, at a reset and when its guarding is ended; the others are spoken to all the same."""
+    drives = {entry.node: Told({(0x6041, 0): 0x0250, (0x6040, 0): 0}) for entry in FILE.drives}
+    link = SimpleNamespace(now=0.0, send=lambda _: None)
+    link.receive = lambda seconds: setattr(link, "now", link.now + seconds)
+    for name in ("require_alone", "require_bus"):
+        monkeypatch.setattr(_stop, name, lambda _: None)
+    monkeypatch.setattr(_stop, "Objects", lambda _, node: drives[node])
+    monkeypatch.setattr(_stop, "GuardedLink", lambda *args: guarded.append(args) or link)
+    guarded: list[Any] = []
+    link_: Any = link
+    for silent, drive in drives.items():
+        drive.silent = 0x6040
+        expected = {node: "no answer" if node == silent else "DISABLED" for node in drives}
+        assert _stop.stop(link_, FILE) == _stop.reset(link_, FILE) == expected
+        drive.silent = 0x6041
+        assert _stop.stop(link_, FILE) == _stop.reset(link_, FILE) == expected
+        assert _stop.disarm(link_, FILE, "life", ()) == {silent: "no answer"}
+        drive.silent = 0x100C
+        assert _stop.disarm(link_, FILE, "life", ()) == {silent: "no answer"}
+        drive.silent = None
+        assert _stop.disarm(link_, FILE, "life", ()) == {}
+        for word, state in ((0x0227, "ENABLED"), (0x0208, "FAULT"), (0x0231, "")):
+            drive.table[0x6041, 0] = word
+            assert _stop.disarm(link_, FILE, "life", ()) == ({silent: f"it is in {state}"} if state else {})
+        drive.table[0x6041, 0] = 0x0250
+    assert {args[2] for args in guarded} == {FILE.guard_cycles * FILE.cycle}
+
+
+def test_a_wait_takes_its_time_however_the_frames_come() -> None:
+    for chunk in (0.03, 1.0, 0.1):
+        link = SimpleNamespace(now=2.0)
+        link.receive = lambda seconds, link=link, chunk=chunk: setattr(link, "now", link.now + min(seconds, chunk))
+        _stop.wait(link, 0.1)  # pyright: ignore[reportArgumentType]
+        assert link.now == pytest.approx(2.1)
 
 
 def test_a_sample_is_logged_once_with_the_set_points_that_were_sent_to_its_end() -> None:
@@ -817,6 +859,7 @@ def test_an_operator_is_asked_in_every_cycle(monkeypatch: pytest.MonkeyPatch) ->
     assert master.told == [("leave", "asked to"), ("stop", "asked to")]
     assert waited == pytest.approx([0.02, 0.03, 0.04])
     assert (times.count, seen) == (2, ["watch"] * 3 + [9.0])
+    assert times.longest_step == 0.0  # there is no real time to be measured
 
 
 @pytest.mark.parametrize("failure", [None, OSError("gone"), KeyboardInterrupt()], ids=str)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import itertools
 import math
@@ -11,6 +12,7 @@ import socket
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -18,6 +20,7 @@ from hypothesis import strategies as st
 
 from softneck.core import SettingsError
 from softneck.drives.logs._result import CycleTimes
+from softneck.drives.running import _keyboard
 from softneck.drives.running._keyboard import Keyboard
 from softneck.drives.running._timing import Ask, Notifier, steady
 
@@ -168,6 +171,146 @@ def test_the_signal_is_given_back_after_an_error_and_left_alone_in_threads() -> 
     thread.start()
     thread.join()
     assert seen == [before]
+
+
+STOPS = {"SIGINT": Ask.LEAVE, "SIGHUP": Ask.LEAVE, "SIGTERM": Ask.LEAVE, "SIGTSTP": Ask.STOP}
+
+
+@unix
+@pytest.mark.parametrize("ignored", [None, *STOPS])
+def test_each_signal_has_its_request_and_one_that_was_ignored_stays_so(
+    ignored: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`nohup` ignores one; that takes none of the others."""
+    monkeypatch.setattr(_keyboard, "_leave_dead_terminal", lambda: left.append("terminal"))
+    for name, ask in STOPS.items():
+        left: list[str] = []
+        before = signal.signal(getattr(signal, ignored or name), signal.SIG_IGN if ignored else signal.SIG_DFL)
+        kept = signal.getsignal(getattr(signal, name))
+        try:
+            with Keyboard() as keyboard:
+                signal.raise_signal(getattr(signal, name))
+                assert keyboard() is (None if name == ignored else ask)
+                assert keyboard.interrupted is (name not in ("SIGTERM", ignored))
+                assert keyboard.terminated is (name == "SIGTERM" != ignored)
+                assert left == ["terminal"] * (name == "SIGHUP" != ignored)
+            assert signal.getsignal(getattr(signal, name)) is kept
+        finally:
+            signal.signal(getattr(signal, ignored or name), before)
+
+
+@pytest.mark.parametrize(
+    ("typed", "asks"),
+    [
+        ([b"\x1b"], [Ask.STOP]), ([b" "], [Ask.STOP]), ([b"x\r\n\x02\x04"], [None]), ([b""], [None]),
+        ([b"\x03"], [Ask.LEAVE]), ([b"\x03", b"", b"\x03"], [Ask.LEAVE, None, Ask.STOP]), ([b"\x03\x03"], [Ask.STOP]),
+        ([b"a\x03 "], [Ask.STOP]), ([b" \x03", b""], [Ask.STOP, None]),
+    ],
+)  # fmt: skip
+def test_keys_that_stop_and_keys_that_leave(typed: list[bytes], asks: list[Ask | None]) -> None:
+    keyboard, keys = Keyboard(), iter(typed)
+    keyboard._read = lambda: next(keys)
+    assert [keyboard() for _ in typed] == asks
+    assert keyboard.interrupted is (b"\x03" in b"".join(typed))
+
+
+@unix
+@pytest.mark.parametrize("front", [True, False])
+def test_the_terminal_is_read_key_by_key_in_front_and_as_before_after(
+    front: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import pty
+    import termios
+
+    ours, theirs = pty.openpty()
+    before = termios.tcgetattr(theirs)
+    with os.fdopen(ours, "wb", buffering=0), os.fdopen(theirs, "r") as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        monkeypatch.setattr(os, "tcgetpgrp", lambda file: os.getpgrp() + (not front) + 100 * (file != theirs))
+        with Keyboard() as keyboard:
+            # Local modes: no line is waited for.
+            assert bool(termios.tcgetattr(theirs)[3] & termios.ICANON) is not front
+            assert keyboard() is None
+            os.write(ours, b" ")
+            assert keyboard() is (Ask.STOP if front else None)
+            # In the background the kernel would stop who reads.
+            os.write(ours, b" ")
+            monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
+            assert keyboard() is None
+
+            def gone(_: int) -> int:
+                raise OSError(5, "gone")
+
+            monkeypatch.setattr(os, "tcgetpgrp", gone)
+            assert keyboard() is None
+        assert termios.tcgetattr(theirs) == before
+    assert _keyboard._unix_keys(theirs) == b""  # closed: no error either
+
+
+def test_without_a_terminal_nothing_is_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    with (tmp_path / "keys").open("w+") as file:
+        file.write("   ")
+        file.seek(0)
+        for stdin in (None, file):
+            monkeypatch.setattr(sys, "stdin", stdin)
+            with Keyboard() as keyboard:
+                assert keyboard() is None
+
+
+def test_on_windows_keys_come_from_its_console(monkeypatch: pytest.MonkeyPatch) -> None:
+    keys = [b"a", b"\x1b"]
+    console = SimpleNamespace(kbhit=lambda: bool(keys), getch=lambda: keys.pop(0))
+    monkeypatch.setitem(sys.modules, "msvcrt", console)
+    monkeypatch.setattr(_keyboard, "sys", SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True), platform="win32"))
+    with Keyboard() as keyboard:
+        assert (keyboard(), keyboard()) == (Ask.STOP, None)
+
+
+@unix
+@pytest.mark.parametrize(("number", "closed"), [(errno.EIO, True), (errno.ENOTTY, False)])
+def test_output_to_a_terminal_that_is_closed_is_discarded(
+    number: int, closed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import termios
+
+    def attributes(_: int) -> None:
+        raise termios.error(number, "gone")
+
+    ended, closed_again = list[object](), list[object]()
+    system = SimpleNamespace(isatty=lambda file: file == 1, dup2=lambda *files: ended.append(files), devnull=os.devnull,
+                             open=lambda *args: args, close=closed_again.append,
+                             O_WRONLY=os.O_WRONLY)  # fmt: skip
+    monkeypatch.setattr(_keyboard, "os", system)
+    monkeypatch.setattr(termios, "tcgetattr", attributes)
+    _keyboard._leave_dead_terminal()
+    # 1 is a terminal that answers, 2 one that does not.
+    assert ended == [((os.devnull, os.O_WRONLY), 2)] * closed
+    assert closed_again == [(os.devnull, os.O_WRONLY)] * closed
+
+
+@unix
+@pytest.mark.parametrize("problem", [None, OSError("gone")])
+def test_a_terminal_is_given_back_from_the_background_too(
+    problem: Exception | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import termios
+
+    seen: list[object] = []
+
+    def restore(*given: object) -> None:
+        seen.append((given, signal.getsignal(signal.SIGTTOU)))
+        if problem is not None:
+            raise problem
+
+    monkeypatch.setattr(termios, "tcsetattr", restore)
+    before = signal.getsignal(signal.SIGTTOU)
+    _keyboard._restore(7, "as before")
+    thread = threading.Thread(target=_keyboard._restore, args=(7, "as before"))
+    thread.start()
+    thread.join()
+    given = (7, termios.TCSADRAIN, "as before")
+    assert seen == [(given, signal.SIG_IGN), (given, before)]
+    assert signal.getsignal(signal.SIGTTOU) is before
 
 
 # -- a steady process -------------------------------------------------------------------------------------------------

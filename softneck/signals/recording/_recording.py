@@ -162,7 +162,7 @@ class Recording(ReprMixin):
         if numbers.shape != (len(U),) or numbers.dtype.kind not in "iu":
             raise DataError(f"`run` must be integers of shape {(len(U),)}; got {numbers.dtype} {numbers.shape}.")
         step = (whose.sample_time_s or _DEFAULT_SAMPLE_TIME_S) if sample_time is None else sample_time
-        begins = np.maximum.accumulate(np.where(np.diff(numbers, prepend=numbers[:1] - 1) != 0, np.arange(len(U)), 0))
+        begins = np.maximum.accumulate(np.where(np.append(True, np.diff(numbers) != 0), np.arange(len(U)), 0))
         return cls((np.arange(len(U)) - begins) * step, step, channels, numbers, whose)
 
     @classmethod
