@@ -487,7 +487,7 @@ def test_the_worst_plant_of_each_requirement_is_written_as_what_it_is(monkeypatc
     verdicts = [Verdict(item, 1.0, False, one) for one in worst]
     under: Any = SimpleNamespace(robot=Robot.preset(), block="block")
     evidence: Any = None
-    necks: Any = [SimpleNamespace(weights="W")]
+    necks: Any = [SimpleNamespace(weights="W"), SimpleNamespace(weights="V")]
     found = Verification(verdicts=verdicts, evidence=evidence, controller=under, necks=necks,
                          requirements=make_requirements({}))  # fmt: skip
     files = found.write_worst("to", controller="c.npz", observer="o.npz", force=True)
