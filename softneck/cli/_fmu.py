@@ -50,8 +50,8 @@ if TYPE_CHECKING:
 @click.option(
     "--sensitivities",
     is_flag=True,
-    help="Add outputs of the next sample (pitch_next, motor_setpoint_1_next, ..) and their directional derivatives; "
-    "with --backend compiled.",
+    help="Add outputs of later samples (pitch_next, pitch_ahead, motor_setpoint_1_next, ..) and their directional "
+    "derivatives; with --backend compiled.",
 )
 @click.option("--name", metavar="NAME", help="Model name of the FMU.  [default: the stem of its file name]")
 @common_options("robot", "force")

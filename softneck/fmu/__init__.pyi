@@ -7,9 +7,9 @@ from .python._zip import unpacked as unpacked
 
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
-from .compiled._build import next_outputs as next_outputs
 from .compiled._compilers import PLATFORMS as PLATFORMS
 from .compiled._library import platforms_built as platforms_built
+from .compiled._look_ahead import next_outputs as next_outputs
 from .compiled._model_file import node_of as node_of
 from .describe._describe import Buildable as Buildable
 from .describe._describe import buildable as buildable

@@ -76,7 +76,7 @@ static int steps(sn_instance *s, int count, int wild)
         for (uint32_t i = 0; i < s->model.n_in; i++)
             (void)sn_set(s, i, s->model.ports[i].flags & SN_BOOLEAN ? (double)(draw() % 8 > 0)
                                : wild ? number() : 0.01 * (double)(draw() % 64));
-        if (s->model.ahead > 0 && s->model.n_in > 0)
+        if (s->model.next > 0 && s->model.n_in > 0)
             look(s, wild);
         if (!sn_do_step(s, s->start + (double)s->count * s->model.sample_time, s->model.sample_time))
             return 0;

@@ -201,12 +201,12 @@ def test_calls_of_the_other_interface_are_refused(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["rls", "pi"])
 def test_sensitivities_are_those_of_co_simulation(kind: str, tmp_path: Path) -> None:
-    """A plant's next outputs are those of the event's own sample, a controller's those of the sample behind it."""
+    """A plant's later outputs are those of the event's own sample, a controller's those of the sample behind it."""
     block = block_of(kind)
     build_compiled_fmu(block, tmp_path / "M.fmu", sensitivities=True)
     reals = [i for i, port in enumerate(block.inputs) if not port.boolean]
     model = fmpy.read_model_description(str(tmp_path / "M.fmu"))
-    ahead = [v.valueReference for v in model.modelVariables if v.name.endswith("_next")]
+    ahead = [v.valueReference for v in model.modelVariables if v.name.endswith(("_next", "_ahead"))]
     u, expected = inputs_of(block, 12, missing=False)[:, reals], []
 
     def look(fmu: Any, row: np.ndarray) -> list[float]:

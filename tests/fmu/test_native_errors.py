@@ -24,10 +24,10 @@ from softneck.cli import main
 from softneck.core import FileFormatError, SettingsError
 from softneck.fmu import build_compiled_fmu, build_fmu
 from softneck.fmu.compiled import _library
-from softneck.fmu.compiled._build import next_outputs
+from softneck.fmu.compiled._look_ahead import look_ahead, next_outputs
 from softneck.fmu.compiled._model_file import model_bytes
 from softneck.fmu.compiled._sources import Sources, c_sources
-from softneck.fmu.describe._description import with_modelled_drives
+from softneck.fmu.describe._description import NO_LOOK_AHEAD, with_modelled_drives
 
 from .every_kind import NATIVE, block_of
 
@@ -62,7 +62,7 @@ def _mended(data: bytes) -> bytes:
     [
         (lambda _: b"", "ends too early"),
         (lambda d: b"PK" + d[2:], "is no model file"),
-        (lambda d: d[:8] + b"\x09" + d[9:], "has format 9; this library reads 2"),
+        (lambda d: d[:8] + b"\x09" + d[9:], "has format 9; this library reads 3"),
         (lambda d: d[:-8], "and should have"),
         (lambda d: d[:-1] + bytes([d[-1] ^ 1]), "its checksum is another one"),
         (lambda d: _mended(d[:-8]), "it ends too early"),
@@ -190,10 +190,10 @@ def test_hostile_files_and_states_break_nothing_under_the_sanitizers(sensitiviti
     files = []
     for kind in filter(_sensitive, NATIVE) if sensitivities else NATIVE:
         block = with_modelled_drives(block_of(kind))
-        ahead = next_outputs(block) if sensitivities else ()
-        block = dataclasses.replace(block, outputs=(*block.outputs, *ahead))
+        ports, looks = look_ahead(block) if sensitivities else ((), NO_LOOK_AHEAD)
+        block = dataclasses.replace(block, outputs=(*block.outputs, *ports))
         files.append(tmp_path / f"{kind}.bin")
-        files[-1].write_bytes(model_bytes(block, kind, "00000000-0000-0000-0000-000000000000", ahead=len(ahead)))
+        files[-1].write_bytes(model_bytes(block, kind, "00000000-0000-0000-0000-000000000000", looks=looks))
     done = subprocess.run(
         ["./fuzz", str(ROUNDS), "1", *map(str, files)], cwd=tmp_path, capture_output=True, text=True, check=False,
         timeout=3000,

@@ -1,8 +1,9 @@
-"""FMUs with sensitivities: what the next sample will be, and its directional derivatives, in FMI 2.0 and 3.0."""
+"""FMUs with sensitivities: what later samples will be, and their directional derivatives, in FMI 2.0 and 3.0."""
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,8 @@ from .conftest import Running
 
 TS = 0.02
 MOTORS = [f"motor_setpoint_{j}" for j in (1, 2, 3)]
-NEXT = ["pitch_next", "roll_next"]
+NEXT, AHEAD = ["pitch_next", "roll_next"], ["pitch_ahead", "roll_ahead"]
+LATER = NEXT + AHEAD
 KINDS = (
     "rls", "rls_mimo", "oe", "nn", "play", "greybox", "guarded", "nlsm",
     "nlsm_residual",
@@ -35,6 +37,19 @@ LAWS = ("pi", "pid", "lqg", "fopi", "hinf", "custom", "nonlinear")
 pytestmark = pytest.mark.skipif(
     shutil.which("cc") is None and not os.environ.get("CI"), reason="no C compiler here, and no library is built"
 )
+
+
+MEASURED = ["pitch_measured", "roll_measured", *(f"motor_position_measured_{j}" for j in (1, 2, 3))]
+
+
+def horizon(path: Path) -> int:
+    """Return the samples that the description tells."""
+    [port] = [v for v in fmpy.read_model_description(str(path)).modelVariables if v.name == "pitch_ahead"]
+    found = re.search(r"(\d+) samples \(([\d.]+) s\) ahead", port.description or "")
+    assert found
+    # Three digits are shown.
+    assert float(found[2]) == pytest.approx(int(found[1]) * TS, rel=5e-3)
+    return int(found[1])
 
 
 def block_of(kind: str) -> Block:
@@ -67,7 +82,7 @@ def move(fmu: Running, rows: int) -> None:
 
 def derivatives(fmu: Running, names: list[str]) -> Matrix:
     """Return (outputs to come, inputs), one input at a time as fmpy gives them."""
-    unknown = [fmu.references[name] for name in NEXT]
+    unknown = [fmu.references[name] for name in LATER]
     columns = [fmu.fmu.getDirectionalDerivative(unknown, [fmu.references[name]], [1.0]) for name in names]
     return np.array(columns).T
 
@@ -79,7 +94,7 @@ def differences(fmu: Running, names: list[str], size: float = 1e-5) -> Matrix:
         sides = []
         for sign in (1.0, -1.0):
             fmu.set(**{name: held + sign * size})
-            sides.append(np.array(fmu.get(*NEXT)))
+            sides.append(np.array(fmu.get(*LATER)))
         fmu.set(**{name: held})
         columns.append((sides[0] - sides[1]) / (2.0 * size))
     return np.array(columns).T
@@ -92,18 +107,39 @@ def test_what_it_says_will_come_comes(path: Path, running: Any) -> None:
         for k, row in enumerate(motion(60)):
             for one in (fmu, blind) if k % 2 else ():  # held for two samples each
                 one.set(**dict(zip(MOTORS, row, strict=True)))
-            said = fmu.get(*NEXT)
+            said = fmu.get(*LATER)
             derivatives(fmu, MOTORS)
             for one in (fmu, blind):
                 one.fmu.doStep(k * TS, TS)
-            assert fmu.get("pitch", "roll") == said
+            assert fmu.get("pitch", "roll") == said[:2]
             # Looking changes nothing.
             assert fmu.get("pitch", "roll") == blind.get("pitch", "roll")
 
 
 @pytest.mark.parametrize("measured", [False, True])
+def test_held_set_points_lead_to_what_is_ahead(path: Path, measured: bool, running: Any) -> None:
+    """What is ahead is a prediction: with measured angles up to now, and without any behind."""
+    h = horizon(path)
+    with running(path) as fmu:
+        fmu.begin(use_measurement=float(measured))
+        move(fmu, 20)
+        if measured:
+            fmu.set(pitch_measured=0.05, roll_measured=-0.1, motor_position_measured_1=0.3)
+        said = fmu.get(*AHEAD)
+        fmu.fmu.doStep(20 * TS, 0.4 * TS)
+        assert fmu.get(*AHEAD) == said  # between samples it is still that of the last one reached
+        fmu.set(**dict.fromkeys(MEASURED, np.nan))
+        fmu.fmu.doStep(20.4 * TS, 0.6 * TS)
+        held = fmu.get("pitch_next")
+        for k in range(21, 20 + h):
+            fmu.fmu.doStep(k * TS, TS)
+        assert fmu.get("pitch", "roll") == said
+        assert h == 1 or fmu.get("pitch_next") != held
+
+
+@pytest.mark.parametrize("measured", [False, True])
 def test_derivatives_are_those_of_differences(path: Path, measured: bool, running: Any) -> None:
-    names = MOTORS + (["pitch_measured", "roll_measured"] if measured else [])
+    names = MOTORS + (MEASURED[:2] if measured else [])
     with running(path) as fmu:
         fmu.begin(use_measurement=float(measured))
         if measured:
@@ -115,7 +151,7 @@ def test_derivatives_are_those_of_differences(path: Path, measured: bool, runnin
         # Along several inputs at once: the sum.
         seeds = np.linspace(-1.0, 1.0, len(names))
         references = [fmu.references[name] for name in names]
-        moved = fmu.fmu.getDirectionalDerivative([fmu.references[name] for name in NEXT], references, seeds.tolist())
+        moved = fmu.fmu.getDirectionalDerivative([fmu.references[name] for name in LATER], references, seeds.tolist())
         np.testing.assert_allclose(moved, exact @ seeds, rtol=1e-12, atol=1e-15)
 
 
@@ -130,12 +166,16 @@ def test_it_is_the_derivative_of_the_python_model(path: Path, kind: str, running
             fmu.set(**dict(zip(MOTORS, row, strict=True)))
             if k == 59:
                 at = block.run(state, rows[:59])[0]
-                X, U, Y = np.zeros((at.values.size, 3)), np.zeros((8, 3)), np.zeros((len(block.outputs), 3))
+                x, y, found = at.values.copy(), at.outputs.copy(), []
+                X, U, Y = np.zeros((x.size, 3)), np.zeros((8, 3)), np.zeros((y.size, 3))
                 U[:3] = np.eye(3)
                 tangent = load_tangent(block.runtime, compiled=False)  # numba would take its time
-                tangent(block.arrays, at.parameters, at.values, rows[k], at.outputs.copy(), X, U, Y, 3)
+                for _ in range(horizon(path)):  # the chain rule, one sample at a time
+                    tangent(block.arrays, at.parameters, x, rows[k], y, X, U, Y, 3)
+                    found.append(Y[:2].copy())
                 # Sums of a network come in another order: rounding of some hundred terms.
-                np.testing.assert_allclose(derivatives(fmu, MOTORS), Y[:2], rtol=1e-10, atol=1e-13)
+                expected = np.vstack([found[0], found[-1]])
+                np.testing.assert_allclose(derivatives(fmu, MOTORS), expected, rtol=1e-10, atol=1e-13)
             fmu.fmu.doStep(k * TS, TS)
 
 
@@ -148,7 +188,10 @@ def test_between_samples_the_next_one_is_settled(path: Path, running: Any) -> No
         said = fmu.get(*NEXT)
         fmu.set(motor_setpoint_1=-3.0)
         assert fmu.get(*NEXT) == said
-        assert not derivatives(fmu, MOTORS).any()
+        moved = derivatives(fmu, MOTORS)
+        assert not moved[:2].any()
+        # Those ahead are not: what is set now acts from the next sample on.
+        np.testing.assert_allclose(moved, differences(fmu, MOTORS), rtol=1e-5, atol=1e-8)
         fmu.fmu.doStep(20.4 * TS, 0.6 * TS)
         assert fmu.get("pitch", "roll") == said
 
@@ -174,15 +217,15 @@ def test_a_state_brings_its_next_sample_back(path: Path, running: Any) -> None:
         fmu.begin()
         move(fmu, 20)
         state = fmu.fmu.getFMUstate()
-        said, moved = fmu.get(*NEXT), derivatives(fmu, MOTORS)
+        said, moved = fmu.get(*LATER), derivatives(fmu, MOTORS)
         move(fmu, 5)
-        assert fmu.get(*NEXT) != said
+        assert fmu.get(*LATER) != said
         fmu.fmu.setFMUstate(state)
-        assert fmu.get(*NEXT) == said
+        assert fmu.get(*LATER) == said
         np.testing.assert_array_equal(derivatives(fmu, MOTORS), moved)
 
 
-def test_what_the_file_says(path: Path) -> None:
+def test_what_the_file_says(path: Path, kind: str, running: Any) -> None:
     assert validate_fmu(str(path)) == []
     model = fmpy.read_model_description(str(path))
     assert model.coSimulation is not None
@@ -191,9 +234,24 @@ def test_what_the_file_says(path: Path) -> None:
         getattr(unknown.variable, "name", ""): {v.name for v in unknown.dependencies or () if v is not None}
         for unknown in model.outputs
     }
-    inputs = {v.name for v in model.modelVariables if v.causality == "input"}
-    assert {name: known[name] == inputs for name in NEXT} == dict.fromkeys(NEXT, True)
-    assert not any(known[name] for name in known.keys() - set(NEXT))
+    assert not any(known[name] for name in known.keys() - set(LATER))
+    acting = {name: known[name] & set(MOTORS) for name in LATER}
+    # A dead time is between a set-point and the next sample, unless a parameter may take it away (`oe` is over motors).
+    assert bool(acting["pitch_next"]) == (kind in ("rls", "guarded"))
+    assert acting["pitch_ahead"] == set(MOTORS)
+    assert acting["roll_ahead"] >= set(MOTORS[1:])
+    # What is declared is what derivatives say along a motion.
+    tunable = any(v.name == "pitch_dead_time" for v in model.modelVariables)
+    found = np.zeros((len(LATER), len(MOTORS)), dtype=bool)
+    with running(path) as fmu:
+        fmu.begin(**({"pitch_dead_time": 0.0, "roll_dead_time": 0.0} if tunable else {}))
+        for k, row in enumerate(motion(40)):
+            fmu.set(**dict(zip(MOTORS, row, strict=True)))
+            found |= derivatives(fmu, MOTORS) != 0.0
+            fmu.fmu.doStep(k * TS, TS)
+    for name, row in zip(LATER, found, strict=True):
+        moving = {motor for motor, moves in zip(MOTORS, row, strict=True) if moves}
+        assert acting[name] >= moving if kind == "guarded" else acting[name] == moving, name
 
 
 def test_fmi3_gives_the_same_bits(path: Path, kind: str, tmp_path: Path, running: Any) -> None:
@@ -202,7 +260,7 @@ def test_fmi3_gives_the_same_bits(path: Path, kind: str, tmp_path: Path, running
     with running(path) as two:
         two.begin()
         move(two, 30)
-        expected, said = derivatives(two, MOTORS), two.get(*NEXT)
+        expected, said = derivatives(two, MOTORS), two.get(*LATER)
     with unpacked(tmp_path / f"{kind}.fmu") as folder:
         model = fmpy.read_model_description(str(folder))
         assert model.coSimulation is not None
@@ -213,7 +271,7 @@ def test_fmi3_gives_the_same_bits(path: Path, kind: str, tmp_path: Path, running
         fmu.instantiate()
         fmu.enterInitializationMode(startTime=0.0)
         fmu.exitInitializationMode()
-        motors, unknown = [references[name] for name in MOTORS], [references[name] for name in NEXT]
+        motors, unknown = [references[name] for name in MOTORS], [references[name] for name in LATER]
         for k, row in enumerate(motion(30)):
             fmu.setFloat64(motors, row.tolist())
             fmu.doStep(currentCommunicationPoint=k * TS, communicationStepSize=TS)

@@ -6,20 +6,20 @@ import hashlib
 import uuid
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import takewhile
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from softneck import __version__
 from softneck.core import SettingsError, as_path, atomic_write, refuse_existing
-from softneck.runtime import Block, Port, TangentError, bundle, with_tangent
+from softneck.runtime import Block
 
 from ..describe._describe import Buildable, FmuInfo, block_and_info, documentation_page
 from ..describe._description import (
+    NO_LOOK_AHEAD,
     Identity,
+    LookAhead,
     exported_block,
     model_description,
-    motor_positions,
     terminals_file,
     with_limit_outputs,
 )
@@ -27,6 +27,7 @@ from ..python._build import check_block, generation_date, license_text, model_na
 from ..python._zip import write_zip
 from ._compilers import PLATFORMS
 from ._library import Library, find_library
+from ._look_ahead import look_ahead
 from ._model_file import model_bytes, node_of
 from ._sources import FLAGS, GENERATED, MAIN, PROBE, Sources
 from .translate._translate import select_kinds
@@ -62,7 +63,8 @@ def build_compiled_fmu(
         force: replace an existing file.
         fmi: 2 or 3.
         platforms: on which the FMU must run, e.g. "x86_64-windows"; none: all with a library on this machine.
-        sensitivities: add outputs of the next sample (`pitch_next`, ..) and their directional derivatives.
+        sensitivities: add outputs of the next sample (`pitch_next`, ..), of a plant also those of a later one
+            (`pitch_ahead`, ..), and their directional derivatives.
         name: the model name, if the file shall have another.
 
     Raises:
@@ -78,40 +80,19 @@ def build_compiled_fmu(
     check_block(block)
     if fmi not in FMI_VERSIONS:
         raise SettingsError(f"unknown FMI version {fmi}; use 2 or 3.")
-    block = with_limit_outputs(exported_block(block))
-    ahead = next_outputs(block) if sensitivities else ()
+    block = exported_block(block)
+    ports, looks = look_ahead(block) if sensitivities else ((), NO_LOOK_AHEAD)
+    block = with_limit_outputs(block)  # the library's own parameter, which no runtime reads
     modules = node_of(block.runtime, block.arrays).modules
-    library = find_library(modules, sensitivities=True) if ahead else find_library(modules)
+    library = find_library(modules, sensitivities=True) if ports else find_library(modules)
     _check_kinds(modules, library.sources)
     folders = _folders(library, platforms, fmi)
-    block = replace(block, outputs=(*block.outputs, *ahead))
-    members = _members(block, said, name, fmi, library.sources, len(ahead))
+    block = replace(block, outputs=(*block.outputs, *ports))
+    members = _members(block, said, name, fmi, library.sources, looks)
     members |= {f"binaries/{folder}/{name}{suffix}": data for folder, suffix, data in folders}
     with atomic_write(target, force=force) as temporary:
         write_zip(temporary, members, library.streams)
     return library.origin
-
-
-def next_outputs(block: Block) -> tuple[Port, ...]:
-    """Return the additional outputs of an FMU with sensitivities: its outputs at the next sample.
-
-    These are the robot's outputs for an identified plant, and the leading numeric outputs for other blocks.
-    Raises SettingsError: a kind that has no derivative, or no such outputs.
-    """
-    try:
-        with_tangent(bundle(block.runtime, loops=False))
-    except TangentError as error:
-        raise SettingsError(f"{block.kind} has no sensitivities: {error}") from None
-    # Motor positions and innovations are internal to the block.
-    aside = (*motor_positions(block), "innovation")
-    own = takewhile(lambda p: not (p.boolean or p.integer or p.missing or p.name in aside), block.outputs)
-    note = "at the next sample, if the inputs are held"
-    found = tuple(
-        replace(port, name=f"{port.name}_next", description=f"{port.description or port.name} {note}") for port in own
-    )
-    if not found:
-        raise SettingsError(f"{block.kind} ({block.role}) has no sensitivities: none of its outputs is a number.")
-    return found
 
 
 def _check_kinds(modules: set[str], sources: Sources) -> None:
@@ -144,20 +125,20 @@ def _folders(library: Library, wanted: Sequence[str], fmi: int) -> list[tuple[st
     return found
 
 
-def _members(block: Block, info: FmuInfo, name: str, fmi: int, sources: Sources, ahead: int) -> dict[str, bytes]:
+def _members(block: Block, info: FmuInfo, name: str, fmi: int, sources: Sources, looks: LookAhead) -> dict[str, bytes]:
     tool = f"softneck {__version__} (compiled)"
     content = hashlib.sha256()
     for part in (
-        model_bytes(block, name, "", ahead=ahead),
-        repr((info, tool, fmi)).encode(),
+        model_bytes(block, name, "", looks=looks),
+        repr((info, tool, fmi, looks.inputs)).encode(),
         *map(str.encode, sources.files.values()),
     ):
         content.update(part)
     guid = str(uuid.uuid5(uuid.NAMESPACE_OID, content.hexdigest()))
-    identity = Identity(name, guid, generation_date(), tool, (MAIN,), ahead)
+    identity = Identity(name, guid, generation_date(), tool, (MAIN,), looks)
     members = {
         "modelDescription.xml": model_description(block, info, identity, fmi=fmi),
-        "resources/model.bin": model_bytes(block, name, guid, ahead=ahead),
+        "resources/model.bin": model_bytes(block, name, guid, looks=looks),
         "documentation/index.html": documentation_page(name, block, info, _HOST_NOTE).encode(),
         "documentation/licenses/license.txt": license_text("softneck", info.license).encode(),
         "sources/README.txt": _REBUILD_README.format(

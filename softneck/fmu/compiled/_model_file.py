@@ -14,10 +14,11 @@ import numpy as np
 from softneck.core import Matrix, SettingsError
 from softneck.runtime import PREFIX, Block, Port, split_members
 
+from ..describe._description import NO_LOOK_AHEAD, LookAhead
 from .translate._kinds import is_known, module_of, ranks_of
 
 _MAGIC_BYTES = b"SNMODEL\0"
-FORMAT = 2
+FORMAT = 3
 _BYTE_ORDER_MARK = 0x01020304
 _HEAD_BYTES = 32
 _BOOLEAN, _MISSING, _INTEGER, _TUNABLE = 1, 2, 4, 8
@@ -70,10 +71,10 @@ def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
     return Node(runs, arrays[:own], tuple(members))
 
 
-def model_bytes(block: Block, name: str, guid: str, *, ahead: int = 0) -> bytes:
+def model_bytes(block: Block, name: str, guid: str, *, looks: LookAhead = NO_LOOK_AHEAD) -> bytes:
     """Return the model file of `block`; by `guid` the library checks that it belongs to the model description.
 
-    The last `ahead` outputs are the first outputs at the next sample.
+    `looks`: which of the last outputs are the first ones at later samples.
     Raises SettingsError: the block's kind is not in the library.
     """
     writer = _Writer()
@@ -82,7 +83,8 @@ def model_bytes(block: Block, name: str, guid: str, *, ahead: int = 0) -> bytes:
     writer.plain("<d", float(block.sample_time))
     ports = (block.inputs, block.outputs, block.parameters)
     # A reference steps like a plant: sample k gives the outputs at k + 1.
-    writer.plain("<5I", block.role in ("plant", "reference"), *map(len, ports), ahead)
+    later = (looks.next, looks.ahead, looks.horizon)
+    writer.plain("<7I", block.role in ("plant", "reference"), *map(len, ports), *later)
     for port in (port for group in ports for port in group):
         writer.port(port)
     writer.node(node_of(block.runtime, block.arrays))

@@ -91,12 +91,31 @@ _OUTPUT_ENDINGS = ("_measured", "_reference")
 
 
 @dataclass(frozen=True, slots=True)
+class LookAhead:
+    """Outputs at later samples, with derivatives; they are the last outputs of an FMU.
+
+    Attributes:
+        next: number of outputs at the next sample.
+        ahead: number of outputs `horizon` samples ahead, behind those.
+        horizon: [samples].
+        inputs: for each of these outputs, the indices of the inputs that it depends on.
+    """
+
+    next: int = 0
+    ahead: int = 0
+    horizon: int = 0
+    inputs: tuple[tuple[int, ...], ...] = ()
+
+
+NO_LOOK_AHEAD = LookAhead()
+
+
+@dataclass(frozen=True, slots=True)
 class Identity:
     """Name, GUID, generation date and build of one FMU.
 
     `name`, `guid`, `date`: as in FMI. `tool`: that built it; None for pythonfmu. `sources`: files to compile it from;
-    empty for FMUs with Python. `ahead`: number of outputs at the next sample, with derivatives; they are the last
-    outputs.
+    empty for FMUs with Python. `looks`: outputs at later samples.
     """
 
     name: str
@@ -104,7 +123,7 @@ class Identity:
     date: str
     tool: str | None = None
     sources: tuple[str, ...] = ()
-    ahead: int = 0
+    looks: LookAhead = NO_LOOK_AHEAD
 
 
 def exported_block(block: Block) -> Block:
@@ -149,7 +168,7 @@ def model_description(block: Block, info: FmuInfo, identity: Identity, *, fmi: i
     if fmi == 2:
         _annotation(SubElement(SubElement(root, "VendorAnnotations"), "Tool", name="softneck"), block, info)
     _variables(root, block, fmi)
-    _structure(root, block, identity.ahead, fmi)
+    _structure(root, block, identity.looks, fmi)
     if fmi == 3:
         _annotation(SubElement(SubElement(root, "Annotations"), "Annotation", type="softneck"), block, info)
     return _text(root)
@@ -197,7 +216,7 @@ def _interfaces(root: Element, block: Block, identity: Identity, fmi: int) -> No
     """Declare Co-Simulation, and Model Exchange of compiled FMUs: one binary has both."""
     state = "FMUstate" if fmi == 2 else "FMUState"
     yes = [f"canGetAndSet{state}", f"canSerialize{state}"] + ["canNotUseMemoryManagementFunctions"] * (fmi == 2)
-    yes += ["providesDirectionalDerivative" + "s" * (fmi == 3)] * bool(identity.ahead)
+    yes += ["providesDirectionalDerivative" + "s" * (fmi == 3)] * bool(identity.looks.next)
     common = {"modelIdentifier": identity.name} | dict.fromkeys(yes, "true")
     no_call = {"completedIntegratorStepNotNeeded": "true"} if fmi == 2 else {"needsCompletedIntegratorStep": "false"}
     own = {"canHandleVariableCommunicationStepSize": "true"}
@@ -277,19 +296,19 @@ def _variable(table: Element, port: Port, causality: str, reference: int, fmi: i
         SubElement(SubElement(table, "ScalarVariable", head), kind, own)
 
 
-def _structure(root: Element, block: Block, ahead: int, fmi: int) -> None:
+def _structure(root: Element, block: Block, looks: LookAhead, fmi: int) -> None:
     structure = SubElement(root, "ModelStructure")
     n_in, n_out = len(block.inputs), len(block.outputs)
     first = 1 if fmi == 2 else 0  # FMI 2.0 counts variables from one, FMI 3.0 has their references
     parameters = [str(n_in + n_out + i + first) for i in range(len(block.parameters))]
-    inputs = [str(i + first) for i in range(n_in)]
     # Outputs only change in a communication step, so they do not depend on inputs directly. Otherwise a master would
     # find an algebraic loop between observer and controller. Initial outputs depend on the parameters. Only the outputs
-    # of the next sample depend on the inputs directly.
+    # of later samples depend on inputs directly.
+    direct: list[tuple[int, ...]] = [()] * (n_out - len(looks.inputs)) + list(looks.inputs)
     for tag, known in (("Output", []), ("InitialUnknown", parameters)):
         group = SubElement(structure, f"{tag}s") if fmi == 2 and n_out else structure
         for i in range(n_out):
-            all_known = " ".join([*inputs, *known] if i >= n_out - ahead else known)
+            all_known = " ".join([*(str(j + first) for j in direct[i]), *known])
             place = str(n_in + i + first)
             if fmi == 2:
                 SubElement(group, "Unknown", index=place, dependencies=all_known)

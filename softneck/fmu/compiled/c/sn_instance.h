@@ -29,6 +29,9 @@ typedef struct {
     sn_v1 next_state, next;
     sn_v2 state_rows, input_rows, next_rows;
     int looked;
+    /* The same of the samples behind it, up to the horizon. */
+    sn_v1 far_state, far_inputs, far;
+    sn_v2 far_state_rows, far_input_rows, far_rows;
     /* Of Model Exchange: whether it is one and in event mode; the event at `instant` took samples from number `first` on,
      * out of what `saved` holds (pending outputs, state), with the inputs in `seen`, `rounds` times. */
     int exchange, event, sampled;
@@ -79,8 +82,9 @@ static void sn_ready(sn_work *w)
     w->fault = NULL;
 }
 
-enum { SN_SIZE, SN_INITIALISE, SN_STEP, SN_LOOK, SN_MOVE };
-enum { SN_SHOWN = 1, SN_WORKED_OUT = 2 }; /* the outputs of the next sample are shown; state and outputs are there */
+enum { SN_SIZE, SN_INITIALISE, SN_STEP, SN_LOOK, SN_MOVE, SN_FAR, SN_FAR_MOVE };
+/* The outputs of the next sample are shown; its state and outputs are there; those at the horizon are shown. */
+enum { SN_SHOWN = 1, SN_WORKED_OUT = 2, SN_FAR_SHOWN = 4 };
 
 /* Let the kind do one of its things; 0 where it broke a rule, `fault` then says which. Nothing else may stand
  * here: what is in this function's registers is gone when `sn_fault` comes back to it. */
@@ -97,6 +101,11 @@ static int sn_guarded(sn_instance *s, int what)
             root->kind->step(&s->work, root, s->parameters, s->state, s->inputs, s->pending);
         else if (what == SN_LOOK)
             root->kind->step(&s->work, root, s->parameters, s->next_state, s->inputs, s->next);
+        else if (what == SN_FAR)
+            root->kind->step(&s->work, root, s->parameters, s->far_state, s->far_inputs, s->far);
+        else if (what == SN_FAR_MOVE)
+            root->kind->tangent(&s->work, root, s->parameters, s->far_state, s->far_inputs, s->far, &s->far_state_rows,
+                                &s->far_input_rows, &s->far_rows, 1);
         else
             root->kind->tangent(&s->work, root, s->parameters, s->next_state, s->inputs, s->next, &s->state_rows,
                                 &s->input_rows, &s->next_rows, 1);
@@ -128,7 +137,7 @@ static int sn_has_limits(const sn_model *m)
 static int sn_make_room(sn_instance *s)
 {
     const sn_model *m = &s->model;
-    size_t ports = (size_t)m->n_in + m->n_out + m->n_par, own = m->n_out - m->ahead, looks, kept, i;
+    size_t ports = (size_t)m->n_in + m->n_out + m->n_par, own = m->n_out - m->next - m->ahead, looks, kept, i;
     double *p, *more;
     s->work.size = 262144u + sn_room_needed(&m->root) + 64u * ports;
     s->work.base = (unsigned char *)malloc(s->work.size);
@@ -139,7 +148,8 @@ static int sn_make_room(sn_instance *s)
         sn_say(s, SN_FAIL, "%s", s->work.fault != NULL ? s->work.fault : "the model has too many states");
         return 0;
     }
-    looks = m->ahead > 0 ? 2u * ((size_t)s->states + own) + m->n_in : 0u;
+    looks = m->next > 0 ? 2u * ((size_t)s->states + own) + m->n_in : 0u;
+    looks += m->ahead > 0 ? 2u * ((size_t)s->states + own + m->n_in) : 0u;
     kept = s->exchange ? own + (size_t)s->states + m->n_in : 0u;
     p = (double *)calloc(ports + own + (size_t)s->states + kept + looks + 1u, sizeof(double));
     s->warned = (unsigned char *)calloc((size_t)m->n_in + m->n_out + 1u, 1);
@@ -161,12 +171,21 @@ static int sn_make_room(sn_instance *s)
     s->saved = (sn_v1){more, s->exchange ? (int32_t)(own + (size_t)s->states) : 0, 1};
     s->seen = (sn_v1){more + s->saved.n, s->exchange ? (int32_t)m->n_in : 0, 1};
     more += kept;
-    if (m->ahead > 0) {
+    if (m->next > 0) {
         s->next_state = (sn_v1){more, (int32_t)s->states, 1};
         s->next = (sn_v1){more += s->states, (int32_t)own, 1};
         s->state_rows = (sn_v2){more += own, (int32_t)s->states, 1, 1, 1};
         s->input_rows = (sn_v2){more += s->states, (int32_t)m->n_in, 1, 1, 1};
-        s->next_rows = (sn_v2){more + m->n_in, (int32_t)own, 1, 1, 1};
+        s->next_rows = (sn_v2){more += m->n_in, (int32_t)own, 1, 1, 1};
+        more += own;
+    }
+    if (m->ahead > 0) {
+        s->far_state = (sn_v1){more, (int32_t)s->states, 1};
+        s->far_inputs = (sn_v1){more += s->states, (int32_t)m->n_in, 1};
+        s->far = (sn_v1){more += m->n_in, (int32_t)own, 1};
+        s->far_state_rows = (sn_v2){more += own, (int32_t)s->states, 1, 1, 1};
+        s->far_input_rows = (sn_v2){more += s->states, (int32_t)m->n_in, 1, 1, 1};
+        s->far_rows = (sn_v2){more + m->n_in, (int32_t)own, 1, 1, 1};
     }
     for (i = 0; i < ports; i++) /* what nobody connects or sets was not measured */
         p[i] = i < m->n_in && (m->ports[i].flags & SN_MISSING) ? sn_from_bits(0x7ff8000000000000u) : m->ports[i].start;
@@ -430,14 +449,16 @@ static int sn_update(sn_instance *s, int *again, double *next)
 static int sn_work_out(sn_instance *s, int how)
 {
     const double *from = s->model.plant && sn_at_sample(s) ? s->saved.p : s->pending.p;
+    int held;
     memcpy(s->next.p, from, (size_t)s->next.n * sizeof(double));
     if (!sn_awaits(s))
         return 1;
     memcpy(s->next_state.p, from + s->pending.n, (size_t)s->state.n * sizeof(double));
-    s->looked &= ~SN_WORKED_OUT; /* nothing of a step that fails */
+    held = s->looked;
+    s->looked = 0; /* nothing of a step that fails */
     if (!sn_worked(s, how))
         return 0;
-    s->looked |= SN_WORKED_OUT;
+    s->looked = held | SN_WORKED_OUT;
     return 1;
 }
 
@@ -450,7 +471,7 @@ static int sn_look_ahead(sn_instance *s)
         return 1;
     if (!(s->looked & SN_WORKED_OUT) && !sn_work_out(s, SN_LOOK))
         return 0;
-    for (uint32_t i = 0; i < m->ahead; i++) {
+    for (uint32_t i = 0; i < m->next; i++) {
         shown[i] = sn_limited(s, i, s->next.p[i]);
         if (!sn_finite(s->next.p[i])) {
             sn_say(s, SN_FAIL, "%.80s becomes %f: the model diverges.", m->ports[m->n_in + s->next.n + i].name, s->next.p[i]);
@@ -461,14 +482,71 @@ static int sn_look_ahead(sn_instance *s)
     return 1;
 }
 
-/* What moves `unknown` outputs, where `known` inputs are moved by `seeds`. All but the outputs of the next sample stay:
+/* Limit what a sample on the way to the horizon gives, as a step does; 0 where the model diverges. A limited output
+ * stays where it is, whatever moves the inputs. */
+static int sn_check_far(sn_instance *s)
+{
+    for (uint32_t i = 0; i < (uint32_t)s->far.n; i++) {
+        const sn_port *port = &s->model.ports[s->model.n_in + i];
+        double x = s->far.p[i];
+        if (sn_infinite(x) || (sn_nan(x) && !(port->flags & SN_MISSING))) {
+            sn_say(s, SN_FAIL, "%.80s becomes %f within %u samples: the model diverges.", port->name, x,
+                   (unsigned)s->model.horizon);
+            return 0;
+        }
+        if (sn_is_limited(s, i, x)) {
+            s->far.p[i] = sn_limited(s, i, x);
+            s->far_rows.p[i] = 0.0;
+        }
+    }
+    return 1;
+}
+
+/* The outputs at the horizon, counted from the last sample that was reached; with `SN_FAR_MOVE` what moves them as well.
+ * The next sample is worked out already. Inputs are held, but what was measured: it is known of the first sample only. */
+static int sn_look_far(sn_instance *s, int how)
+{
+    const sn_model *m = &s->model;
+    size_t states = (size_t)s->state.n * sizeof(double), own = (size_t)s->far.n * sizeof(double);
+    memcpy(s->far_state.p, s->looked & SN_WORKED_OUT ? s->next_state.p : s->state.p, states);
+    memcpy(s->far.p, s->next.p, own);
+    if (how == SN_FAR_MOVE) {
+        memcpy(s->far_state_rows.p, s->state_rows.p, states);
+        memcpy(s->far_rows.p, s->next_rows.p, own);
+    }
+    for (uint32_t i = 0; i < m->n_in; i++) {
+        int measured = m->ports[i].flags & SN_MISSING;
+        s->far_inputs.p[i] = measured ? sn_from_bits(0x7ff8000000000000u) : s->inputs.p[i];
+        s->far_input_rows.p[i] = measured ? 0.0 : s->input_rows.p[i];
+    }
+    if (!sn_check_far(s))
+        return 0;
+    for (uint32_t k = 1; k < m->horizon; k++)
+        if (!sn_worked(s, how) || !sn_check_far(s))
+            return 0;
+    return 1;
+}
+
+static int sn_show_far(sn_instance *s)
+{
+    if (s->looked & SN_FAR_SHOWN)
+        return 1;
+    if (!sn_look_ahead(s) || !sn_look_far(s, SN_FAR))
+        return 0;
+    memcpy(s->outputs.p + s->next.n + s->model.next, s->far.p, (size_t)s->model.ahead * sizeof(double));
+    s->looked |= SN_FAR_SHOWN;
+    return 1;
+}
+
+/* What moves `unknown` outputs, where `known` inputs are moved by `seeds`. All but the outputs of later samples stay:
  * an input that is set shows in none of them before a communication step. */
 static int sn_derivative(sn_instance *s, const uint32_t *unknown, size_t n, const uint32_t *known, size_t n_known,
                          const double *seeds, double *moved)
 {
     const sn_model *m = &s->model;
-    uint32_t first = m->n_in + (uint32_t)s->next.n;
-    if (m->ahead == 0) {
+    uint32_t first = m->n_in + (uint32_t)s->next.n, far = first + m->next;
+    int reached = 0;
+    if (m->next == 0) {
         sn_say(s, SN_FAIL, "this FMU was built without derivatives (softneck fmu --sensitivities).");
         return 0;
     }
@@ -486,14 +564,21 @@ static int sn_derivative(sn_instance *s, const uint32_t *unknown, size_t n, cons
     if (!sn_work_out(s, SN_MOVE))
         return 0;
     for (size_t i = 0; i < n; i++) {
+        uint32_t own = unknown[i] - (unknown[i] < far ? first : far);
         if (unknown[i] < m->n_in || unknown[i] >= m->n_in + m->n_out) {
             sn_say(s, SN_FAIL, "variable %u: derivatives are of outputs.", (unsigned)unknown[i]);
             return 0;
         }
-        if (unknown[i] < first || sn_is_limited(s, unknown[i] - first, s->next.p[unknown[i] - first]))
+        if (unknown[i] >= far) {
+            if (!reached && !sn_look_far(s, SN_FAR_MOVE))
+                return 0;
+            reached = 1;
+            moved[i] = s->far_rows.p[own];
+        } else if (unknown[i] < first || sn_is_limited(s, own, s->next.p[own])) {
             moved[i] = 0.0;
-        else
-            moved[i] = s->next_rows.p[unknown[i] - first];
+        } else {
+            moved[i] = s->next_rows.p[own];
+        }
     }
     return 1;
 }
@@ -564,10 +649,13 @@ static SN_MERGED int sn_set(sn_instance *s, uint32_t i, double value)
     return sn_set_rarely(s, i, value);
 }
 
-static int sn_is_ahead(const sn_instance *s, uint32_t i)
+/* Work out an output of a later sample; other variables are there. */
+static int sn_look_for(sn_instance *s, uint32_t i)
 {
-    uint32_t end = s->model.n_in + s->model.n_out;
-    return i < end && i >= end - s->model.ahead;
+    uint32_t end = s->model.n_in + s->model.n_out, far = end - s->model.ahead;
+    if (i >= end || i < far - s->model.next)
+        return 1;
+    return i < far ? sn_look_ahead(s) : sn_show_far(s);
 }
 
 /* What is not an output of now. */
@@ -577,7 +665,7 @@ SN_APART static int sn_get_rarely(sn_instance *s, uint32_t i, double *value)
         sn_say(s, SN_FAIL, "there is no variable %u.", (unsigned)i);
         return 0;
     }
-    if (!sn_initialise(s) || (sn_is_ahead(s, i) && !sn_look_ahead(s)))
+    if (!sn_initialise(s) || !sn_look_for(s, i))
         return 0;
     *value = s->values.p[i];
     /* An input that was never set shows its start value: hosts expect a number. */

@@ -12,12 +12,13 @@
 
 #include "sn_kinds.h"
 
-#define SN_FORMAT 2u
+#define SN_FORMAT 3u
 #define SN_HEAD 32
 #define SN_DEEPEST 8
 #define SN_MOST_PORTS 100000u
 #define SN_MOST_MEMBERS 64u
 #define SN_MOST_STATES (1 << 24)
+#define SN_MOST_HORIZON 10000u
 #define SN_TEXT 400
 
 enum { SN_BOOLEAN = 1, SN_MISSING = 2, SN_INTEGER = 4, SN_TUNABLE = 8 };
@@ -30,7 +31,8 @@ typedef struct {
     double sample_time;
     int plant;
     uint32_t n_in, n_out, n_par;
-    uint32_t ahead; /* the last outputs: the first ones as they will be at the next sample */
+    uint32_t next, ahead; /* the last outputs: the first ones at the next sample, then those `horizon` samples from now */
+    uint32_t horizon;
     sn_port *ports;
     sn_node root;
 } sn_model;
@@ -250,7 +252,9 @@ static int sn_parse_model(sn_model *model, unsigned char *bytes, size_t size, co
     model->n_in = sn_take_u32(&r);
     model->n_out = sn_take_u32(&r);
     model->n_par = sn_take_u32(&r);
+    model->next = sn_take_u32(&r);
     model->ahead = sn_take_u32(&r);
+    model->horizon = sn_take_u32(&r);
     if (error[0] != '\0')
         return 0;
     if (!(model->sample_time > 1e-9 && model->sample_time < 1e9))
@@ -264,11 +268,14 @@ static int sn_parse_model(sn_model *model, unsigned char *bytes, size_t size, co
     for (uint64_t i = 0; i < count; i++)
         if (!sn_take_port(&r, &model->ports[i]))
             return 0;
-    if (model->ahead > model->n_out / 2)
-        return sn_refuse(&r, "%u of its %u outputs cannot be those of the next sample.", model->ahead, model->n_out);
+    if (model->ahead > model->next || 2u * (uint64_t)model->next + model->ahead > model->n_out)
+        return sn_refuse(&r, "%u and %u of its %u outputs cannot be those of later samples.", model->next, model->ahead,
+                         model->n_out);
+    if ((model->ahead > 0 && model->horizon == 0) || model->horizon > SN_MOST_HORIZON)
+        return sn_refuse(&r, "outputs %u samples ahead cannot be.", model->horizon);
     if (!sn_take_node(&r, &model->root, 0))
         return 0;
-    if (model->ahead > 0 && model->root.kind->tangent == NULL)
+    if (model->next > 0 && model->root.kind->tangent == NULL)
         return sn_refuse(&r, "this library holds no derivative of `%.100s`.", model->root.kind->name);
     return r.at == r.end ? 1 : sn_refuse(&r, "has bytes behind its end.");
 }
