@@ -258,7 +258,9 @@ def _step(task: _Task, plant: SimulationModel, number: int, kg: float, orientati
     step = RobotReference(kind="step", values=tuple(size * s for s in shares), at=at)
     block, connections = scale_loop_gain(task.controller, task.observer, outputs)
     parameters = {f"share_{axis}": float(s) for axis, s in zip(outputs, draws.share, strict=True)}
-    parameters |= {"keep": draws.keep, "noise": scale.si(float(asked.step["noise_deg"])), "noise_seed": float(number)}
+    # A recording that is noisier than what is asked is believed.
+    noise = max(scale.si(float(asked.step["noise_deg"])), float(draws.noise.max()))
+    parameters |= {"keep": draws.keep, "noise": noise, "noise_seed": float(number)}
     loop = Loop(
         plant=plant.quiet(task.controller.sample_time), controller=BlockPart(task.controller),
         observer=None if task.observer is None else BlockPart(task.observer),

@@ -231,9 +231,9 @@ def test_outputs_of_a_draw_are_those_that_its_sensor_tells() -> None:
 
 @pytest.mark.parametrize("angle", [0.0, 90.0])
 @pytest.mark.parametrize("load", [0.0, -0.05])
-@pytest.mark.parametrize("diverges", [False, True])
+@pytest.mark.parametrize(("diverges", "sensed", "noise"), [(False, 0.1, 0.2), (True, 0.1, 0.2), (False, 0.3, 0.3)])
 def test_a_step_of_a_draw_has_its_disturbance_and_then_its_load(
-    angle: float, load: float, diverges: bool, monkeypatch: pytest.MonkeyPatch
+    angle: float, load: float, diverges: bool, sensed: float, noise: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = make_requirements(
         {"step": {"load_rad": load, "noise_deg": 0.2}, "sim": {"size_deg": 10.0, "duration_s": 2.5}}
@@ -255,8 +255,11 @@ def test_a_step_of_a_draw_has_its_disturbance_and_then_its_load(
     monkeypatch.setattr(_drawn, "run_loop", run)
     monkeypatch.setattr(_drawn, "Loop", lambda **settings: SimpleNamespace(**settings))
     motors = np.array([[1.0, 0.0], [0.5, -1.0], [0.0, 2.0]])
+    # The worse sensor's noise, if more than the 0.2 deg asked.
+    draws = told_draws()
+    draws.noise = np.radians([0.01, sensed])
     task: Any = SimpleNamespace(
-        asked=asked, draws=told_draws(), controller=pi().block(), observer=None, order="parallel", motors=motors
+        asked=asked, draws=draws, controller=pi().block(), observer=None, order="parallel", motors=motors
     )
     plant: Any = SimpleNamespace(quiet=lambda ts: ("quiet", ts), carrying=lambda kg: {"plant_inputs": {"payload": kg}})
     found = _drawn._step(task, plant, 4, 0.3, math.radians(angle))
@@ -270,7 +273,7 @@ def test_a_step_of_a_draw_has_its_disturbance_and_then_its_load(
     assert {key: louder[key] for key in ("share_pitch", "share_roll", "keep", "noise_seed")} == {
         "share_pitch": 0.01, "share_roll": 0.02, "keep": 0.9, "noise_seed": 4.0,
     }  # fmt: skip
-    assert louder["noise"] == pytest.approx(math.radians(0.2), rel=1e-12)
+    assert louder["noise"] == pytest.approx(math.radians(noise), rel=1e-12)
     # A load on the stepped axis, spread over the motors that move it, when the step has had its time.
     column = motors[:, 0 if angle == 0.0 else 1]
     expected = [(j + 1, load * share, 3.0) for j, share in enumerate(column) if share and load]

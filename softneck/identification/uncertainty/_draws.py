@@ -21,7 +21,7 @@ from softneck.core import (
     require_whole,
     silent,
 )
-from softneck.signals import Recording, concatenate, conditions, merge_conditions
+from softneck.signals import Recording, check_channel, concatenate, conditions, merge_conditions
 
 from ..models._arrays import check_arrays
 from ..models._fitting import ScaledData
@@ -44,8 +44,10 @@ _FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 _CALIBRATION_DRAWS = 40
 # Factors on the disturbance, until the band covers the held-out samples.
 _MORE = tuple(1.1**k for k in range(25))
-# Deviations of the disturbance in the band: 95 % of a normal distribution.
+# Deviations of disturbance and noise in the band: 95 % of a normal distribution.
 _DEVIATIONS = 1.96
+# Share of what is left over that is disturbance at least, where the sensor's noise explains all of it.
+_LEAST_DISTURBANCE = 0.05
 # Classes of amplitude, by the share of the largest motion of the segments.
 _CLASSES = (("small", 0.0, 0.25), ("middle", 0.25, 0.6), ("large", 0.6, math.inf))
 
@@ -71,6 +73,7 @@ class Draws(ReprMixin):
         factor: on the deviations of the fit.
         share: (outputs,) of the disturbance that a motion makes: `d[k+1] = keep d[k] + share dy[k] n[k]`, n normal.
         keep: of the disturbance, its colour.
+        noise: (outputs,) standard deviation of the sensor's noise in the held-out motions [SI].
         level: share of held-out samples that were to be covered.
         coverage: of each class of amplitude: "class", "motion", "covered", "width" and "segments", outputs in SI.
         conditions: payload and co-contraction of the recordings, and "motion", the largest of the outputs [SI].
@@ -83,6 +86,7 @@ class Draws(ReprMixin):
     factor: float
     share: Vector
     keep: float
+    noise: Vector
     level: float
     coverage: list[dict[str, Any]]
     conditions: Mapping[str, list[float]]
@@ -138,7 +142,7 @@ class Draws(ReprMixin):
             "model": header, "names": list(self.arrays), "count": self.count, "seed": self.seed, "factor": self.factor,
             "keep": self.keep, "level": self.level, "coverage": self.coverage, "conditions": dict(self.conditions),
         }  # fmt: skip
-        return facts, {**arrays, **own, "share": self.share}
+        return facts, {**arrays, **own, "share": self.share, "noise": self.noise}
 
     @classmethod
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Draws:
@@ -152,15 +156,15 @@ class Draws(ReprMixin):
             whole = name in model.arrays and values.shape[1:] == model.arrays[name].shape
             if not whole or values.dtype != np.float64 or not np.isfinite(values).all():
                 raise FileFormatError(f"the draws of its array `{name}` do not fit its model.")
-        share = arrays["share"]
-        if share.shape != (len(model.robot.outputs.names),) or not (share >= 0.0).all():
-            raise FileFormatError("the disturbance of its draws must have one share for each output.")
+        share, noise, one_each = arrays["share"], arrays["noise"], (len(model.robot.outputs.names),)
+        if not all(own.shape == one_each and (own >= 0.0).all() for own in (share, noise)):
+            raise FileFormatError("its draws must have one share of the disturbance and one noise for each output.")
         if not 0.0 <= float(header["keep"]) < 1.0:
             raise FileFormatError("the disturbance of its draws must have a colour below 1.")
         found = cls(
             model=model, arrays=drawn, count=count, seed=int(header["seed"]), factor=float(header["factor"]),
-            share=share, keep=float(header["keep"]), level=float(header["level"]), coverage=list(header["coverage"]),
-            conditions=dict(header["conditions"]),
+            share=share, keep=float(header["keep"]), noise=noise, level=float(header["level"]),
+            coverage=list(header["coverage"]), conditions=dict(header["conditions"]),
         )  # fmt: skip
         for number in range(min(size)):
             check_arrays(model.kind, found._draw(number).arrays)
@@ -216,7 +220,7 @@ def make_draws(
     made = merge_conditions([conditions(part) for part in recordings])
     return Draws(
         model=source.model, arrays={name: np.array([row[name] for row in rows]) for name in rows[0]}, count=count,
-        seed=seed, factor=factor, share=more * share, keep=keep, level=LEVEL,
+        seed=seed, factor=factor, share=more * share, keep=keep, noise=motions.noise, level=LEVEL,
         coverage=motions.coverage(best[2], more * share, keep),
         conditions={**made, "motion": _motion(whole)},
     )  # fmt: skip
@@ -257,7 +261,8 @@ class _Motions:
     """Held-out motions in segments.
 
     recording, model: to simulate; outputs: (rows, outputs) measured; groups: (rows,) segment, -1 in the warm-up;
-    motion: (segments,) largest motion of an output [SI]; classes: (segments,) of amplitude.
+    motion: (segments,) largest motion of an output [SI]; classes: (segments,) of amplitude; noise: (outputs,) standard
+    deviation of the sensor [SI], which loops add to every draw: it is no disturbance.
     """
 
     recording: Recording
@@ -266,6 +271,7 @@ class _Motions:
     groups: np.ndarray
     motion: Vector
     classes: np.ndarray
+    noise: Vector
 
     @classmethod
     def of(cls, held: Recording, model: Model, second: float) -> _Motions:
@@ -283,7 +289,7 @@ class _Motions:
         motion = np.array([0.5 * np.ptp(y[group == k], axis=0).max() for k in range(group.max() + 1)])
         part = motion / motion.max()
         classes = np.searchsorted([low for _, low, _ in _CLASSES], part, side="right") - 1
-        return cls(held, model, y, group, motion, classes)
+        return cls(held, model, y, group, motion, classes, _noise(held))
 
     def simulate(self, draws: Sequence[Mapping[str, Matrix]]) -> np.ndarray:
         """Return the simulations (draws, rows, outputs)."""
@@ -307,12 +313,15 @@ class _Motions:
 
     def disturbance(self, Y: np.ndarray) -> tuple[Vector, float]:
         """Return share (outputs,) and colour of what the nearest draw of each segment leaves over."""
-        keep, parts, total = self._colour(Y), [], []
+        keep, parts, noise, total = self._colour(Y), [], [], []
         for k in range(len(self.motion)):
             e, moved = self._left(Y, k, keep)
             parts.append((e**2).sum(axis=0))
+            noise.append(len(e) * self.noise**2)
             total.append(moved.sum(axis=0))
-        return np.sqrt(np.sum(parts, axis=0) / np.maximum(np.sum(total, axis=0), 1e-300)), keep
+        left = np.sum(parts, axis=0)
+        left = np.maximum(left - np.sum(noise, axis=0), _LEAST_DISTURBANCE * left)
+        return np.sqrt(left / np.maximum(np.sum(total, axis=0), 1e-300)), keep
 
     def _left(self, Y: np.ndarray, k: int, keep: float) -> tuple[Matrix, Matrix]:
         """Return what the nearest draw leaves over (rows, outputs), and what a disturbance of share 1 would have."""
@@ -327,17 +336,15 @@ class _Motions:
         for k in range(len(self.motion)):
             e = self._left(Y, k, 0.0)[0]
             top += float((e[1:] * e[:-1]).sum())
-            bottom += float((e[:-1] ** 2).sum())
+            # White noise is in the variance, and in no covariance.
+            bottom += float(np.maximum((e[:-1] ** 2).sum(axis=0) - (len(e) - 1) * self.noise**2, 0.0).sum())
         return float(np.clip(top / max(bottom, 1e-300), 0.0, 0.999))
 
     def band(self, Y: np.ndarray, share: Vector, keep: float) -> tuple[Matrix, Matrix]:
         """Return the lowest and highest outputs (rows, outputs) of the draws with their disturbance."""
         middle = np.median(Y, axis=0)
-        sigma = share * np.sqrt(_filtered(np.diff(middle, axis=0, prepend=middle[:1]), keep))
-        # What the sensor rounds and adds is in no draw: the least difference of its values.
-        steps = np.abs(np.diff(self.outputs, axis=0))
-        noise = np.array([np.median(s[s > 0.0]) if (s > 0.0).any() else 0.0 for s in steps.T])
-        away = _DEVIATIONS * sigma + noise
+        variance = share**2 * _filtered(np.diff(middle, axis=0, prepend=middle[:1]), keep)
+        away = _DEVIATIONS * np.sqrt(variance + self.noise**2)
         return Y.min(axis=0) - away, Y.max(axis=0) + away
 
     def coverage(self, Y: np.ndarray, share: Vector, keep: float) -> list[dict[str, Any]]:
@@ -357,6 +364,16 @@ class _Motions:
     def covers(self, Y: np.ndarray, share: Vector, keep: float) -> bool:
         """Return whether the band covers the level at every amplitude."""
         return all(row["covered"] >= LEVEL for row in self.coverage(Y, share, keep))
+
+
+def _noise(recording: Recording) -> Vector:
+    """Return the standard deviation of each sensor's noise (outputs,), as the recording shows it [SI]."""
+    found = []
+    for name in recording.robot.outputs.names:
+        channel = check_channel(recording, name)
+        # Rounded values are as uncertain as their steps are wide.
+        found.append(max(float(np.nan_to_num(channel.noise)), (channel.quantum or 0.0) / math.sqrt(12.0)))
+    return np.array(found)
 
 
 def _filtered(moves: Matrix, keep: float) -> Matrix:

@@ -81,6 +81,7 @@ def test_a_family_file_keeps_its_draws_to_the_bit(made: Callable[..., Draws], tm
     again = load(tmp_path / "f.npz", role="family").draws
     assert bits(again.for_certificate(2)) == bits(found.for_certificate(2))
     np.testing.assert_array_equal(again.share, found.share)
+    np.testing.assert_array_equal(again.noise, found.noise)
     assert (again.keep, again.factor, again.coverage) == (found.keep, found.factor, found.coverage)
     start = recordings_start(found)
     np.testing.assert_array_equal(again.for_search()[0].simulate(start), found.for_search()[0].simulate(start))
@@ -90,7 +91,7 @@ def recordings_start(found: Draws) -> np.ndarray:
     return np.ones((50, len(found.model.robot.motors.names)))
 
 
-@pytest.mark.parametrize("spoil", ["shape", "nan", "few", "share"])
+@pytest.mark.parametrize("spoil", ["shape", "nan", "few", "share", "noise"])
 def test_draws_that_do_not_fit_their_model_are_refused(made: Callable[..., Draws], spoil: str) -> None:
     found = made()
     header, arrays = found.to_archive()
@@ -101,9 +102,29 @@ def test_draws_that_do_not_fit_their_model_are_refused(made: Callable[..., Draws
     elif spoil == "few":
         arrays["drawn_weights"] = arrays["drawn_weights"][:4]
     else:
-        arrays["share"] = -found.share
+        arrays[spoil] = -arrays[spoil]
     with pytest.raises(FileFormatError, match="draws"):
         Draws.from_archive(header, arrays)
+
+
+def test_a_noisier_sensor_is_no_larger_disturbance(made: Callable[..., Draws], recordings: list[Recording]) -> None:
+    found, added = made(), np.array([0.004, 0.008])
+    assert found.noise.shape == added.shape
+    rng = np.random.default_rng(3)
+    held = _draws._split(_draws.concatenate(recordings), 1.0)[1]
+    noisy = dict(
+        zip(held.robot.outputs.names, (held.outputs + added * rng.normal(size=held.outputs.shape)).T, strict=True)
+    )
+    loud = replace(held, channels={**held.channels, **noisy})
+    draws = [{name: values[k] for name, values in found.arrays.items()} for k in range(20)]
+    before, after = (_draws._Motions.of(each, found.model, 1.0) for each in (held, loud))
+    # 450 rows tell a deviation to 1 / sqrt(900) = 3 %, fourth differences to about three times that.
+    np.testing.assert_allclose(after.noise, np.hypot(before.noise, added), rtol=0.15)
+    Y = before.simulate(draws)
+    share, louder = before.disturbance(Y)[0], after.disturbance(Y)[0]
+    # Left over would be the noise, added to both in squares; what a wrong estimate of 15 % leaves is half of it.
+    motion = np.abs(np.diff(held.outputs, axis=0)).mean(axis=0)
+    assert (louder < share + 0.5 * added / motion).all()
 
 
 @pytest.mark.slow
