@@ -56,9 +56,9 @@ class GreyBoxDraws:
     _factors: dict[float, Matrix] = field(default_factory=dict)
 
     @classmethod
-    def fit(cls, recording: Recording, *, progress: Progress = silent) -> GreyBoxDraws:
-        """Fit the grey box to a recording, and what draws need."""
-        model = GreyBox().fit(recording, progress=lambda done, text: progress(0.9 * done, text))
+    def fit(cls, recording: Recording, *, body: str = "rigid", progress: Progress = silent) -> GreyBoxDraws:
+        """Fit the grey box with a body to a recording, and what draws need."""
+        model = GreyBox(body=body).fit(recording, progress=lambda done, text: progress(0.9 * done, text))
         scaled = ScaledData.of(training_recording(recording), amplitudes=False)
         second = scaled.scaling.second
         table = {row["name"]: float(row["value"]) for row in model.findings["numbers"]}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any, Protocol
 
 import numpy as np
@@ -177,10 +178,11 @@ def make_draws(
 ) -> Draws:
     """Return draws of a robot from its recordings.
 
-    The model is fitted to the first three quarters of each run: for robots that tendons bend the grey box, else kind
-    `play`. Of the deviations of its numbers times a factor those are taken that predict the last quarters best, by the
-    continuous ranked probability score (Gneiting and Raftery 2007, J. Am. Stat. Assoc. 102:359). What the nearest draw
-    leaves over there is the disturbance; it is raised until the band covers `LEVEL` of the samples at every amplitude.
+    Models are fitted to the first three quarters of each run: for robots that tendons bend the grey box without and
+    with its optional parts, else kind `play`. The model and the factor on the deviations of its numbers are those that
+    predict the last quarters best, by the continuous ranked probability score (Gneiting and Raftery 2007, J. Am. Stat.
+    Assoc. 102:359). What the nearest draw leaves over there, less the sensor's noise, is the disturbance; it is raised
+    until the band covers `LEVEL` of the samples at every amplitude.
 
     Args:
         recordings: of one robot and sample time, the payload as a channel.
@@ -197,21 +199,22 @@ def make_draws(
     whole = concatenate(recordings)
     second = ScaledData.of(whole).scaling.second
     train, held = _split(whole, second)
-    source = _source(train, lambda done, text: progress(0.7 * done, f"draws: {text}"))
-    motions = _Motions.of(held, source.model, second)
-    rng = np.random.default_rng([seed, 0])
-    trial = [source.draw(rng) for _ in range(_CALIBRATION_DRAWS)]
-    best: tuple[float, float, np.ndarray] | None = None
-    for number, factor in enumerate(_FACTORS):
-        progress(0.7 + 0.15 * number / len(_FACTORS), f"draws: deviations times {factor:g}")
-        Y = motions.simulate([source.arrays(draw, factor) for draw in trial])
+    sources = _sources(train, lambda done, text: progress(0.7 * done, f"draws: {text}"))
+    motions = _Motions.of(held, sources[0].model, second)
+    best: tuple[float, Source, float, np.ndarray] | None = None
+    for number, (source, factor) in enumerate(product(sources, _FACTORS)):
+        progress(0.7 + 0.15 * number / (len(sources) * len(_FACTORS)), f"draws: deviations times {factor:g}")
+        rng = np.random.default_rng([seed, 0])
+        trial = [source.draw(rng) for _ in range(_CALIBRATION_DRAWS)]
+        Y = replace(motions, model=source.model).simulate([source.arrays(draw, factor) for draw in trial])
         score = motions.score(Y)
         if best is None or score < best[0]:
-            best = (score, factor, Y)
+            best = (score, source, factor, Y)
     if best is None or not math.isfinite(best[0]):
         raise DataError("no draw has a finite simulation on the held-out motions; record longer.")
-    factor, (share, keep) = best[1], motions.disturbance(best[2])
-    more = next((more for more in _MORE if motions.covers(best[2], more * share, keep)), _MORE[-1])
+    _, source, factor, Y = best
+    share, keep = motions.disturbance(Y)
+    more = next((more for more in _MORE if motions.covers(Y, more * share, keep)), _MORE[-1])
     rows = []
     rng = np.random.default_rng([seed, 1])
     for number in range(SEARCH_DRAWS + ATTEMPTS * count):
@@ -221,7 +224,7 @@ def make_draws(
     return Draws(
         model=source.model, arrays={name: np.array([row[name] for row in rows]) for name in rows[0]}, count=count,
         seed=seed, factor=factor, share=more * share, keep=keep, noise=motions.noise, level=LEVEL,
-        coverage=motions.coverage(best[2], more * share, keep),
+        coverage=motions.coverage(Y, more * share, keep),
         conditions={**made, "motion": _motion(whole)},
     )  # fmt: skip
 
@@ -232,11 +235,12 @@ def _motion(recording: Recording) -> list[float]:
     return np.nanmax(np.abs(recording.outputs - middle), axis=0).tolist()
 
 
-def _source(train: Recording, progress: Progress) -> Source:
+def _sources(train: Recording, progress: Progress) -> list[Source]:
+    """Return what draws may come from: grey boxes without and with optional parts; of other robots kind `play`."""
     try:
-        return GreyBoxDraws.fit(train, progress=progress)
+        return [GreyBoxDraws.fit(train, body=body, progress=progress) for body in ("rigid", "all")]
     except SettingsError:  # a robot that no tendons on winches bend
-        return PlayDraws.fit(train, progress=progress)
+        return [PlayDraws.fit(train, progress=progress)]
 
 
 def _split(recording: Recording, second: float) -> tuple[Recording, Recording]:

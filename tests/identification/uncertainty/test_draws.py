@@ -37,7 +37,7 @@ def made(recordings: list[Recording]) -> Callable[..., Draws]:
     @cache
     def make(seed: int = 0) -> Draws:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(_draws, "_source", lambda *_: source)
+            patch.setattr(_draws, "_sources", lambda *_: [source])
             patch.setattr(_draws, "_FACTORS", (1.0, 2.0))
             patch.setattr(_draws, "_CALIBRATION_DRAWS", 10)
             return make_draws(recordings, count=3, seed=seed)
@@ -105,6 +105,24 @@ def test_draws_that_do_not_fit_their_model_are_refused(made: Callable[..., Draws
         arrays[spoil] = -arrays[spoil]
     with pytest.raises(FileFormatError, match="draws"):
         Draws.from_archive(header, arrays)
+
+
+@pytest.mark.parametrize("worse_first", [False, True])
+def test_draws_come_from_the_model_that_predicts_the_held_out_motions_better(
+    recordings: list[Recording], worse_first: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train = _draws._split(_draws.concatenate(recordings), 1.0)[0]
+    # A pole three times slower than the neck's, and a chain of two instead of three.
+    good, bad = (PlayDraws.fit(train, settings=each) for each in (QUICK, replace(QUICK, rate=2.0, order=2)))
+    monkeypatch.setattr(_draws, "_sources", lambda *_: [bad, good] if worse_first else [good, bad])
+    monkeypatch.setattr(_draws, "_FACTORS", (1.0, 2.0))
+    monkeypatch.setattr(_draws, "_CALIBRATION_DRAWS", 10)
+    found = make_draws(recordings, count=2)
+    assert found.model is good.model
+    # The numbers are those of this model too.
+    assert {name: values.shape[1:] for name, values in found.arrays.items()} == {
+        "weights": good.model.arrays["weights"].shape
+    }
 
 
 def test_a_noisier_sensor_is_no_larger_disturbance(made: Callable[..., Draws], recordings: list[Recording]) -> None:
