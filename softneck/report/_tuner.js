@@ -96,13 +96,17 @@ class Tuner {
     const found = this.plots[panel].renderers.find(one => one.name === name);
     if (!found) return;
     const { glyph, data_source } = found;
-    if (!this.pending.has(data_source)) this.pending.set(data_source, { ...data_source.data });
+    if (!this.pending.has(data_source)) this.pending.set(data_source, {});
     for (const [key, values] of Object.entries(columns)) this.pending.get(data_source)[glyph[key].field] = values;
   }
   draw(one) {
     this.pending = new Map();
     this.fill(one);
-    for (const [source, data] of this.pending) source.data = data;
+    // As a patch: a change of `data` would build the legends anew.
+    for (const [source, data] of this.pending) {
+      Object.assign(source.data, data);
+      source.patching.emit();
+    }
   }
   fill(one) {
     const { panels, names } = this, curves = one.curves, time = this.time;
@@ -138,6 +142,8 @@ class Tuner {
     this.choose(one);
   }
   begin() {
+    // Above the axes, in a layer that is painted without them.
+    for (const plot of this.plots) for (const one of plot.renderers) one.level = "overlay";
     for (const id of ["speed", "caution", "holding"]) at(id).addEventListener("input", () => this.move());
     at("best").addEventListener("click", () => { at("holding").checked = false; this.place(this.best); });
     this.requirements.forEach((item, k) => at(`limit-${k}`).addEventListener("input", event => {
