@@ -6,14 +6,17 @@ import math
 import time
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from softneck.core import DataError
 from softneck.loop import BlockPart
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block
-from softneck.verification import linear_plant
+from softneck.verification import _experiments, linear_plant
 from softneck.verification._experiments import (
     _SMALL_RAD,
     LEAD_IN_S,
@@ -266,3 +269,39 @@ def test_an_experiment_leads_to_its_posture_waits_and_kicks() -> None:
                              (0.999 * REST_S, 1.0, 0.0), (REST_S, 1.0, 1.0), (50.0, 1.0, 1.0)):  # fmt: skip
         expected = [there * p + on * k for p, k in zip(posture, kick, strict=True)]
         assert reference(slower * time_) == pytest.approx((*expected, there * 0.6), abs=1e-15)
+
+
+@pytest.mark.parametrize("outputs", [("pitch",), ("pitch", "roll"), ("roll", "pitch")])
+def test_the_last_two_windows_of_an_experiment_are_compared_over_all_outputs(
+    outputs: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_experiments, "_oscillation", lambda angle, most: float(np.ptp(angle)) + 0.0 * most)
+    rows = round(_experiments._WINDOW_S * 2.0 / TS)
+    time = TS * np.arange(round(2.0 * REST_S / TS) + 3 * rows)
+    swing = np.where(np.arange(time.size) % 2, 0.5, -0.5)
+    size = np.full(time.size, 9.0)
+    size[-2 * rows : -rows], size[-rows:] = 0.2, 0.3
+    size[-1] = 0.4  # the very last row counts, and the one before the first does not
+    both = {"pitch": size * swing, "roll": 0.1 * size * swing}
+    loop: Any = SimpleNamespace(time=2.0, outputs=outputs, size=1.0, controller=SimpleNamespace(sample_time=TS))
+    made = Experiment(loop, "both", "gain_up", 0.1, (0.0, 0.0))
+    told: list[Any] = [both]
+
+    class Result(dict):
+        sample_time = TS
+
+    def run(*_: Any) -> Any:
+        if isinstance(told[0], Exception):
+            raise told[0]
+        found = Result(told[0])
+        found.time = time  # pyright: ignore[reportAttributeAccessIssue]
+        return found
+
+    monkeypatch.setattr(Experiment, "_run", run)
+    assert made._windows(2.0, 0.0) == pytest.approx((0.2, 0.35))
+    told[0] = DataError("overflow")
+    assert made._windows(2.0, 0.0) == (0.0, math.inf)
+    # A loop that does not answer at gain 1 has no margin; at another gain it is at rest.
+    told[0] = dict.fromkeys(("pitch", "roll"), np.zeros(time.size))
+    assert made._windows(1.0, 0.0) == (0.0, math.inf)
+    assert made._windows(1.0, 1.0) == made._windows(1.1, 0.0) == (0.0, 0.0)

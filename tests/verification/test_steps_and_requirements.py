@@ -6,16 +6,20 @@ import json
 import math
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import control
 import numpy as np
 import pytest
 
-from softneck.core import DataError, SettingsError
+from softneck.core import DataError, FileFormatError, SettingsError
 from softneck.core._certificate import required_rows
+from softneck.estimation import LinearNeck
 from softneck.loop import LoopResult, metrics
 from softneck.robot import Robot
-from softneck.verification import Scale, make_requirements, metric_names, metric_title, read_requirements
+from softneck.verification import Scale, _plants, make_requirements, metric_names, metric_title, read_requirements
 from softneck.verification._linear import LinearLaw, frequency_grid
 from softneck.verification._plants import (
     all_plants,
@@ -24,9 +28,10 @@ from softneck.verification._plants import (
     nominal_plants,
     source_of_family,
     source_of_model,
+    within_weight,
 )
 from softneck.verification._requirements import Requirement, apply_safety_margin, expand_metrics, select_for_verify
-from softneck.verification._steps import StepTest, _metrics, run_steps
+from softneck.verification._steps import StepTest, _metrics, check_ports, run_steps
 from softneck.verification._verify import sources_of, to_json
 
 from .necks import TS, controller_of, family, linear_neck, pi
@@ -414,3 +419,128 @@ def test_every_metric_has_a_plain_name_of_its_own_beside_its_key(robot: str) -> 
     assert all(title.endswith(f" ({metric})") for title, metric in zip(titles, metrics, strict=True))
     assert len({title.rpartition(" (")[0] for title in titles}) == len(titles)
     assert metric_title("axes.gain_margin") == "gain margin, worst axis (axes.gain_margin)"
+
+
+# -- channels, scales and weights -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name", ["pitch_reference", "roll_reference", "pitch", "roll", "motor_setpoint_1", "motor_setpoint_3"]
+)
+def test_a_controller_must_have_every_channel_of_its_robot(name: str) -> None:
+    block = pi().block()
+    check_ports(block, Robot.preset())
+    kept = {what: tuple(port for port in getattr(block, what) if port.name != name) for what in ("inputs", "outputs")}
+    with pytest.raises(
+        SettingsError, match=f"has no channel `{name}`; softneck verifies controllers from pitch, roll and"
+    ):
+        check_ports(SimpleNamespace(kind="pi", **kept), Robot.preset())  # pyright: ignore[reportArgumentType]
+
+
+CART = Robot.from_dict({
+    "name": "cart", "directions": {"kind": "matrix", "matrix": [[1.0, 0.5], [0.0, 1.0]]},
+    "motors": {"names": ["a", "b"], "unit": "V", "setpoint_min": [-2.0, -2.0], "setpoint_max": [2.0, 6.0]},
+    "outputs": {"names": ["x", "y"], "unit": "mm"},
+})  # fmt: skip
+
+
+def source_with(*axes: tuple[float, float], Ts: float = 0.01) -> Any:
+    """Return a source whose axes have these static gains [m/V] and poles [1/s]."""
+    boxes = [SimpleNamespace(nominal=np.array([gain, pole, 0.0])) for gain, pole in axes]
+    return SimpleNamespace(axes=boxes, sample_time=Ts, weights=np.array([[1.0, 0.5], [0.0, 1.0]]))
+
+
+def test_a_scale_is_that_of_the_slowest_and_least_of_all_plants() -> None:
+    """What is known of a robot without ranges of its outputs is what its plants do; for the neck all is 1."""
+    assert Scale.of(Robot.preset()) == Scale(robot=Robot.preset())
+    assert (Scale().time, Scale().size, Scale().load, Scale().noise, Scale().gain) == (
+        1.0,
+        1.0,
+        1.0,
+        1.0,
+        pytest.approx(1.0),
+    )
+    one, two = source_with((0.02, 5.0), (0.03, 4.0)), source_with((0.05, 9.0), (0.04, 8.0))
+    found = Scale.of(CART, [one, two])
+    assert found == Scale.of(CART, [two, one])
+    assert found.known
+    assert not Scale.of(CART).known
+    # Seconds by the slowest pole, or by the sample time where that is longer.
+    assert Scale.of(CART, [one]).time == found.time
+    assert Scale.of(CART, [two]).time == pytest.approx(found.time * 4.0 / 8.0)
+    assert Scale.of(CART, [source_with((0.02, 5.0), (0.03, 4.0), Ts=0.5)]).time == pytest.approx(2.0 * found.time)
+    # Inputs by the least that the motors add up to: half the ranges of 2 and 4 V, weighted: 4 and 4; outputs by the
+    # least of gain times that.
+    size = Scale.of(CART, [source_with((0.02, 5.0), (0.01, 4.0))]).size
+    assert size == pytest.approx(0.5 * Scale.of(CART, [one]).size)
+    assert found.size == pytest.approx(Scale.of(CART, [one]).size)
+    assert Scale.of(CART, [source_with((-0.02, 5.0), (0.03, 4.0))]).size == pytest.approx(found.size)
+    assert found.load == Scale.of(CART, [two]).load
+    halved = replace(CART, motors=replace(CART.motors, setpoint_min=(-1.0, -1.0), setpoint_max=(1.0, 3.0)))
+    assert Scale.of(halved, [one]).load == pytest.approx(0.5 * found.load)
+    assert Scale.of(halved, [one]).size == pytest.approx(0.5 * found.size)
+    # A range that is stated and narrower goes first.
+    narrow = replace(CART, outputs=replace(CART.outputs, min=(-0.1, -0.1), max=(0.1, 0.1)))
+    wide = replace(CART, outputs=replace(CART.outputs, min=(-1e6, -1e6), max=(1e6, 1e6)))
+    assert Scale.of(narrow, [one]).size < found.size == pytest.approx(Scale.of(wide, [one]).size)
+    loud = replace(CART, noise_std=0.3)
+    assert Scale.of(loud, [one]).noise == pytest.approx(0.3 / 0.05)
+    assert found.noise == pytest.approx(found.size, rel=1e-11)
+
+
+@pytest.mark.parametrize("reach", [1.0, 0.3, 0.0])
+def test_what_the_recordings_exclude_goes_towards_the_best_sample_up_to_their_border(
+    reach: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Plants on lines from the best sample: those beyond `reach` end within a thousandth of the way before it."""
+    best, other = np.array([1.0, 5.0, 0.1]), np.array([1.2, 6.0, 0.1])
+    way = np.array([1.0, -2.0, 0.5])
+    monkeypatch.setattr(
+        _plants, "_excess", lambda rows, *_: np.abs((rows - best) @ way) / (way @ way) / max(reach, 1e-9)
+    )
+    box: Any = SimpleNamespace(measured=object(), nominal=other, samples=np.array([other + way, best]))
+    rows = best + np.array([0.0, 0.2, 0.31, 1.0, 2.0])[:, None] * way
+    found = (within_weight(rows, box, TS) - best) @ way / (way @ way)
+    for share, length in zip(found, (0.0, 0.2, 0.31, 1.0, 2.0), strict=True):
+        if length <= reach:
+            assert share == pytest.approx(length)
+        else:
+            assert reach - length * 2.0**-10 - 1e-9 <= share <= reach + 1e-9
+    # Where even the best is excluded the order is too low, and all stays as it is.
+    monkeypatch.setattr(_plants, "_excess", lambda rows, *_: np.full(len(rows), 1.0 + 1e-9))
+    assert within_weight(rows, box, TS) is rows
+    monkeypatch.setattr(_plants, "_excess", lambda rows, *_: np.full(len(rows), 1.0))
+    np.testing.assert_allclose(within_weight(rows, box, TS), rows)
+    assert within_weight(rows, SimpleNamespace(measured=None), TS) is rows  # pyright: ignore[reportArgumentType]
+
+
+def test_axes_of_a_model_have_one_sample_time_to_a_billionth() -> None:
+    a, b = (control.TransferFunction([0.1], [1.0, -0.9], TS * factor) for factor in (1.0, 1.0 + 3e-9))
+    for axes in ((a, b), (b, a)):
+        with pytest.raises(SettingsError, match="m: pitch and roll have different sample times"):
+            source_of_model(LinearNeck(*axes), "m", SPREAD)
+    unstable = control.TransferFunction([0.1], [1.0, -1.1], TS)
+    with pytest.raises(SettingsError, match=r"^m: .*not stable"):
+        source_of_model(LinearNeck(a, unstable), "m", SPREAD)
+
+
+def test_a_file_of_requirements_is_a_path_and_its_errors_name_it(tmp_path: Path) -> None:
+    path = tmp_path / "r.toml"
+    for wrong in (3, [path], {"a": 1}):
+        with pytest.raises(SettingsError, match="requirements are a file or a table; got a"):
+            read_requirements(wrong)  # pyright: ignore[reportArgumentType]
+    for text, error, message in (
+        ("version = 1\n[sim]\nnecks = -1\n", SettingsError, "necks"), ("version = 2\n", FileFormatError, "must be 1"),
+        ("[sim]\n", FileFormatError, "got None"), ("version = \n", FileFormatError, "is not valid TOML"),
+        ("version = 1\nreserve = 3\n", SettingsError, "`reserve` must be a table"),
+        ("version = 1\nrequire = 3\n", SettingsError, "`require` must be a table"),
+    ):  # fmt: skip
+        path.write_text(text)
+        with pytest.raises(error, match=rf"r\.toml: .*{message}"):
+            read_requirements(path)
+    with pytest.raises(FileFormatError, match=r"none\.toml: "):
+        read_requirements(tmp_path / "none.toml")
+    with pytest.raises(SettingsError, match="`require` must be a table"):
+        expand_metrics({"require": 3, "overshoot_pct": 5.0}, Robot.preset(), stepping=True)
+    with pytest.raises(SettingsError, match=r"unknown requirement `overshot_pct`; .*overshoot_pct"):
+        expand_metrics({"overshot_pct": 5.0}, Robot.preset(), stepping=True)
