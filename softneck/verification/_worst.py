@@ -61,7 +61,7 @@ def linear_plant(
     numerator: ArrayLike,
     denominator: ArrayLike,
     delay: Sequence[int],
-    cross: Sequence[float] = (0.0, 0.0),
+    cross: ArrayLike = (),
     sample_time: float = 0.02,
     robot: Mapping[str, Any] | None = None,
     directions: ArrayLike | None = None,
@@ -74,7 +74,7 @@ def linear_plant(
         numerator: (outputs, q), highest power of z first; the first of each is 0.
         denominator: (outputs, q), monic.
         delay: additional samples of each axis.
-        cross: (outputs (outputs - 1),) gains of the other axes' inputs over the axis's own, axis by axis.
+        cross: (outputs (outputs - 1),) gains of the other axes' inputs over the axis's own, axis by axis; default zero.
         sample_time: [s].
         robot: tables of a robot other than the neck.
         directions: (outputs, motors) weights of its motors in each axis's input.
@@ -111,7 +111,7 @@ def linear_plant(
     positions = [Port(name=name, unit=motor) for name in whose.motor_positions]
     most = 0.2 if unit == "rad" else None
     noise = Port(name="noise_std", unit=unit, description="noise of the measured angles", minimum=0.0, maximum=most)
-    mixed = mixing_matrix(np.asarray(cross[: m * (m - 1)], float), m)
+    mixed = mixing_matrix(np.asarray(cross, float) if np.size(cross) else np.zeros(m * (m - 1)), m)
     return Block(
         kind="linear_plant",
         role="plant",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -290,7 +291,7 @@ def test_hanus_gain_is_taken_where_it_forgets(pole: float, hanus: bool) -> None:
 
 
 def test_a_controller_of_the_error_has_equal_ways_for_reference_and_output() -> None:
-    K = control.ss(control.TransferFunction([3.0, -2.9], [1.0, -1.0], DT))
+    K: Any = control.ss(control.TransferFunction([3.0, -2.9], [1.0, -1.0], DT))
     axis = error_feedback(K)
     np.testing.assert_array_equal(axis.Br, -axis.By)
     assert axis.Dr == -axis.Dy == 3.0
@@ -311,7 +312,7 @@ def test_a_delay_is_a_line_of_inputs_and_poles_and_margins_count_it(delay: int, 
     for plants in ([lag, other], [other, lag]):
         poles = closed_poles(axis, plants, extra)
         for row, plant in zip(poles, plants, strict=True):
-            loop = control.feedback(
+            loop: Any = control.feedback(
                 control.TransferFunction([0.6, -0.55], [1.0, -1.0], DT) * plant.tf(extra_delay=extra)
             )
             expected = np.abs(loop.poles())
@@ -427,7 +428,8 @@ def test_the_filter_for_a_rise_gives_it_on_the_loop(ratio: float, extra: int) ->
     for _ in range(3000):
         x = a * x + (1.0 - a) * r
         rows.append((1.0 - led.jump) * x + led.jump * r)
-    y = control.forced_response(control.feedback(K * G, 1), np.arange(3000) * DT, np.array(rows)).outputs
+    u: Any = np.array(rows)
+    y = control.forced_response(control.feedback(K * G, 1), np.arange(3000) * DT, u).outputs
     assert rise_time(np.asarray(y), DT) == pytest.approx(asked, rel=1e-4)
 
 
@@ -453,7 +455,7 @@ def test_a_search_begins_at_two_speeds_and_the_best_that_keeps_the_bounds_is_tak
     starts: list[PidGains] = []
 
     class Judge:
-        def __init__(self, loads: list[float | None]) -> None:
+        def __init__(self, loads: Sequence[float | None]) -> None:
             self.sweep, self.loads = SimpleNamespace(test=SimpleNamespace(gain_unit=4.0)), loads
 
         def select_hardest(self, gains: PidGains) -> Judge:

@@ -324,9 +324,9 @@ class Slide:
 
     sample_time, directions = TS, np.eye(1)
 
-    def __init__(self, gain: float = 1.0, *, limit: float = 5.0, name: str = "slide", **more: Any) -> None:
+    def __init__(self, gain: float = 1.0, *, limit: float = 5.0, **more: Any) -> None:
         self.robot = Robot.from_dict({
-            "name": name, "motors": {"names": ["a"], "unit": "V", "setpoint_min": [-limit], "setpoint_max": [limit]},
+            "name": "slide", "motors": {"names": ["a"], "unit": "V", "setpoint_min": [-limit], "setpoint_max": [limit]},
             "outputs": {"names": ["x"], "unit": "mm"}, "directions": {"kind": "matrix", "matrix": [[1.0]]},
         })  # fmt: skip
         self.directions = np.array([[gain]])
@@ -349,7 +349,9 @@ def test_of_several_models_the_first_says_whose_limits_and_directions_count() ->
         assert [sample.static_gain for sample in plant.axis("x").samples] == pytest.approx([m.gain for m in models])
         assert plant.axes["x"].family == 2
     assert uncertain_plant(wide, narrow.robot).robot is narrow.robot
-    for act in (lambda: uncertain_plant([wide, Slide(name="other", **{"robot": Robot.preset("arm")})]),
+    other = Slide()
+    other.robot = Robot.preset("arm")
+    for act in (lambda: uncertain_plant([wide, other]),
                 lambda: uncertain_plant(wide, Robot.preset("arm"))):  # fmt: skip
         with pytest.raises((DataError, SettingsError)):
             act()

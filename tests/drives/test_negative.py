@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -55,8 +56,8 @@ GOOD: dict[tuple[int, int], int] = {
 class Told:
     """The objects of one drive, without a bus: what is not in the table is aborted, as is a write to `refused`."""
 
-    def __init__(self, changes: dict[tuple[int, int], int | None] | None = None, **more: Any) -> None:
-        table: dict[tuple[int, int], Any] = GOOD | (changes or {})
+    def __init__(self, changes: Mapping[tuple[int, int], int | None] | None = None, **more: Any) -> None:
+        table: dict[tuple[int, int], Any] = {**GOOD, **(changes or {})}
         self.table = {key: value for key, value in table.items() if value is not None}
         self.refused: dict[int, int] = more.get("refused", {})
         self.kept: dict[int, int] = more.get("kept", {})

@@ -18,6 +18,7 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block
 from softneck.verification import _experiments, linear_plant
 from softneck.verification._experiments import (
+    _AUDIBLE_SHARE_DOWN,
     _SMALL_RAD,
     LEAD_IN_S,
     REST_S,
@@ -305,3 +306,24 @@ def test_the_last_two_windows_of_an_experiment_are_compared_over_all_outputs(
     told[0] = dict.fromkeys(("pitch", "roll"), np.zeros(time.size))
     assert made._windows(1.0, 0.0) == (0.0, math.inf)
     assert made._windows(1.0, 1.0) == made._windows(1.1, 0.0) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("what", "share"), [("gain_up", 0.1), ("delay", 0.1), ("gain_down", _AUDIBLE_SHARE_DOWN)])
+def test_an_oscillation_is_heard_above_a_share_of_the_step_and_twice_the_floor(
+    what: str, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop: Any = SimpleNamespace(controller=SimpleNamespace(sample_time=TS))
+    made = Experiment(loop, "both", what, 0.2, (0.0, 0.0))
+    asked: list[tuple[float, float]] = []
+    for floor, least in ((0.0, 0.2 * share), (1.0, 2.0)):
+        for last, heard in ((1.01 * least, True), (0.99 * least, False)):
+            # As loud as before, or nearly so.
+            for before, sustained in (
+                (last, True),
+                (last / 0.98, True),
+                (last / 0.96, last >= 0.6),
+                (math.inf, last >= 0.6),
+            ):
+                monkeypatch.setattr(Experiment, "_windows", lambda _, *at, w=(before, last): asked.append(at) or w)
+                assert made.try_at(4.0, floor) == (heard and sustained, last)
+    assert set(asked) == {{"gain_up": (4.0, 0.0), "gain_down": (0.25, 0.0), "delay": (1.0, 4.0 / TS)}[what]}

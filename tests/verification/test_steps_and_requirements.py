@@ -159,6 +159,8 @@ def test_lists_of_numbers_have_theirs(key: str, most: float) -> None:
     [
         ({"axes.sensitivity": {"max": 1.0}}, True),
         ({"axes.sensitivity": {"max": 1.0 - 1e-9}}, False),
+        ({"axes.gain_margin": {"max": 1.0}, "axes.sensitivity": False}, True),
+        ({"axes.gain_margin": {"max": 1.0 - 1e-9}, "axes.sensitivity": False}, False),
         ({"axes.disk_margin": {"min": 2.0}, "axes.sensitivity": False}, True),
         ({"axes.disk_margin": {"min": 2.0 + 1e-9}, "axes.sensitivity": False}, False),
         ({"step.rise_s": {"min": 1.0, "max": 1.0}}, True),

@@ -180,7 +180,7 @@ GOOD: dict[str, Any] = {
     ],
 )  # fmt: skip
 def test_a_linear_plant_answers_one_sample_later_at_least(change: dict[str, Any], message: str) -> None:
-    linear_plant(**GOOD)
+    assert linear_plant(**GOOD).arrays[3].tolist() == [[1.0, 0.0], [0.0, 1.0]]
     with pytest.raises(SettingsError, match=message):
         linear_plant(**{**GOOD, **change})
 
