@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from statistics import NormalDist
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError, Vector, require_one_of, to_si
+from softneck.core import DataError, Matrix, SettingsError, Vector, require_one_of, to_si
 from softneck.robot import Robot
 from softneck.runtime import Port
 
@@ -51,26 +52,30 @@ class ActiveFault:
             NormalDist().inv_cdf(1.0 - 0.5 * getattr(fault, "share", 0.0)) if kind == "outlier" else 0.0
         )
 
-    def amount(self, k: int) -> Vector:
-        """Return the values (n,) that the fault adds at row `k`."""
+    def amounts(self, first: int, stop: int) -> np.ndarray:
+        """Return what the fault adds at rows `first` to `stop`: (rows, n), or (n,) where it is always the same."""
         fault = self.fault
         if isinstance(fault, NeckFault):
             return self._scale * np.array(list(fault.values.values()))
-        if fault.kind == "noise" and isinstance(fault, SensorFault):
-            return self._scale * fault.std * self._draws(k)
-        if fault.kind == "outlier":
-            draw = self._draws(k)
-            return np.where(np.abs(draw) > self._outlier_quantile, self._scale * fault.size * np.sign(draw), 0.0)
-        return self._scale * fault.size
+        size = self._scale * (fault.std if fault.kind == "noise" and isinstance(fault, SensorFault) else fault.size)
+        if not self.drawn:
+            return size
+        rows = _normal_rows(getattr(fault, "seed"), first, stop, len(self.slots))  # noqa: B009
+        if fault.kind == "noise":
+            return size * rows
+        return np.where(np.abs(rows) > self._outlier_quantile, size * np.sign(rows), 0.0)
 
     @property
     def most(self) -> Vector:
         """The largest move of a slow motor in one step (n,)."""
         return self._scale * getattr(self.fault, "rate", 0.0) * self._step
 
-    def _draws(self, k: int) -> Vector:
-        """Return the normal draws (n,) of row `k`; they depend on seed and row alone, so that there is no state."""
-        return np.random.default_rng([getattr(self.fault, "seed"), k]).standard_normal(len(self.slots))  # noqa: B009
+
+# Loops of a search and of its certificates have the same few seeds.
+@lru_cache(maxsize=32)
+def _normal_rows(seed: int, first: int, stop: int, count: int) -> Matrix:
+    """Return the normal draws (rows, count); each row depends on seed and row alone, so that there is no state."""
+    return np.array([np.random.default_rng([seed, k]).standard_normal(count) for k in range(first, stop)])
 
 
 class FaultStages:
@@ -97,7 +102,7 @@ class FaultStages:
             most[span] = acting.most
         for acting, span in adding:
             if not acting.drawn:
-                self._added[acting.first : acting.last, span] = acting.amount(0)
+                self._added[acting.first : acting.last, span] = acting.amounts(0, 0)
         numbers = (most, self._added, memory)
         self.lists = (tuple(detours), codes, slots, *numbers)
         table = np.array(codes, dtype=np.int64).reshape(-1, 9)
@@ -107,8 +112,9 @@ class FaultStages:
     def draw(self, first: int, stop: int) -> None:
         """Draw the random values of rows `first` to `stop`."""
         for acting, span in self._drawn:
-            for k in range(max(first, acting.first), min(stop, acting.last)):
-                self._added[k, span] = acting.amount(k)
+            start, end = max(first, acting.first), min(stop, acting.last)
+            if start < end:
+                self._added[start:end, span] = acting.amounts(start, end)
 
 
 def place_faults(

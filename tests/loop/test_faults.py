@@ -10,7 +10,7 @@ import pytest
 
 from softneck.core import DataError, SettingsError
 from softneck.loop import Fault, Loop, LoopResult, MotorFault, NeckFault, SensorFault, SineReference, run_loop
-from softneck.loop._disturbed_bus import sensor_outputs
+from softneck.loop._disturbed_bus import ActiveFault, _normal_rows, sensor_outputs
 from softneck.loop._faults import FAULT_KINDS, make_fault
 from softneck.robot import Robot
 from softneck.runtime import Port
@@ -256,3 +256,16 @@ def test_faults_are_of_the_robot_s_outputs_and_units() -> None:
         sensor_outputs(SensorFault(kind="dropout", axis="pitch"), plant, robot)
     with pytest.raises(SettingsError, match="`size` must be between"):
         make_fault("motor_offset", {"size_kPa": 200.0}, robot)
+
+
+def test_noise_of_a_row_follows_from_seed_and_row_however_the_rows_are_run() -> None:
+    whole = _normal_rows(3, 0, 10, 2)
+    np.testing.assert_array_equal(whole, np.vstack([_normal_rows(3, 0, 4, 2), _normal_rows(3, 4, 10, 2)]))
+    np.testing.assert_array_equal(whole[7], np.random.default_rng([3, 7]).standard_normal(2))
+    assert len({*whole.ravel().tolist(), *_normal_rows(4, 0, 10, 2).ravel().tolist()}) == 40
+    # The candidates of a search share their noise: it is drawn once, and no loop changes it.
+    assert _normal_rows(3, 0, 10, 2) is whole
+    fault = SensorFault(kind="noise", std=2.0, seed=3)
+    acting = ActiveFault(fault, [0, 1], [], np.array([1.0, 0.5]), 0.02)
+    np.testing.assert_array_equal(acting.amounts(0, 10), whole * [2.0, 1.0])
+    assert _normal_rows(3, 0, 10, 2) is whole
