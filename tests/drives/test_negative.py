@@ -25,9 +25,9 @@ from softneck.drives.master._events import Event
 from softneck.drives.master._fieldbus import Fieldbus, NodeState
 from softneck.drives.master._gate import BAD, DROPOUT, FROZEN, Gate
 from softneck.drives.master._limiter import Limiter
-from softneck.drives.master._master import Master, Measurement
+from softneck.drives.master._master import _MAX_CLAMPED_S, Master, Measurement
 from softneck.drives.master._settings import LimitSettings, WatchSettings
-from softneck.drives.master._supervisor import ACTIVE
+from softneck.drives.master._supervisor import ACTIVE, Signal
 from softneck.drives.master._watches import Patience, Watches, timing
 from softneck.drives.running import _bus_loop, _certified, _pilot, _preflight, _stop
 from softneck.drives.running._bus_loop import RunEnd, Session
@@ -1279,3 +1279,73 @@ def test_the_gate_takes_what_may_be_and_nothing_else() -> None:
     gone = round(DROPOUT / 0.02)
     assert passed(Tilt(0.0, 0.0), *[None] * (gone - 1))[1] == []
     assert passed(Tilt(0.0, 0.0), *[None] * gone)[1] == ["sensor_lost"]
+
+
+@pytest.mark.parametrize("phase", list(Phase))
+def test_a_request_from_outside_has_the_time_of_the_last_step_and_reacts_by_the_phase(phase: Phase) -> None:
+    for now in (None, 42.0):
+        for act, reason in (("stop", "pressed"), ("leave", "asked"), ("start", ""), ("finish", "")):
+            master = _master(Pilot())
+            master.supervisor.phase, master._now = phase, now
+            getattr(master, act)(*[reason] * bool(reason))
+            assert master.requests == [(act, reason)]
+            moving, before = phase in (Phase.RAMP_IN, Phase.RUNNING), phase in (Phase.IDLE, Phase.ENABLING)
+            name = {"stop": "operator", "leave": "left" if moving else "operator" if before else ""}.get(act, "")
+            assert [(event.name, event.node, event.time, event.detail) for event in master.events] == [
+                (name, 0, now or 0.0, reason)
+            ] * bool(name)
+            assert master.counts.total() == bool(name)
+            signals = {"start": [Signal.START], "finish": [Signal.FINISH], "leave": [Signal.FINISH] * moving}
+            assert master._asked == signals.get(act, [])
+
+
+@pytest.mark.parametrize("motor", [0, 1, 2])
+def test_a_limit_of_any_motor_is_told_of_the_run_and_lasts_for_its_time(motor: int) -> None:
+    master, told = _master(Pilot()), list[Event]()
+    wanted = [0.0] * 3
+    wanted[motor] = 100.0
+    cycles = round(_MAX_CLAMPED_S / master.settings.bus.cycle)
+    for cycle in range(cycles + 2):
+        events: list[Event] = []
+        master._limit(0.01 * cycle, wanted, events, count=False)
+        assert events == []
+        master._limit(0.01 * cycle, wanted, events, count=True)
+        assert (events[0].name, events[0].node, events[0].time) == ("clamped", 0, 0.01 * cycle)
+        assert events[0].detail in ("position", "speed", "acceleration")
+        told += events[1:]
+    assert {(event.name, event.node) for event in told} == {("clamp_persistent", 0)}
+    assert cycles - 2 <= round(told[0].time / 0.01) <= cycles
+    assert master.setpoints[motor] > 0.0
+    assert [value for k, value in enumerate(master.setpoints) if k != motor] == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("at", [-1, 0, 1, 2])
+def test_drives_are_enabled_one_after_the_other_each_in_its_time(at: int) -> None:
+    """The run waits for a sample of the sensor once all are; one that does not come is named."""
+    for sample in (Tilt(0.0, 0.0), None):
+        master = _master(Pilot())
+        master.supervisor.phase, master._gate.last = Phase.ENABLING, sample
+        events: list[Event] = []
+        for k, view in enumerate(master.bus.drives):
+            view.state, view.fresh = (DriveState.ENABLED if k != at else DriveState.SWITCHED_ON), True
+        for cycle in range(5):
+            master._enable(7.0 + 0.01 * cycle, events)
+        assert events == []
+        assert (master.supervisor.phase is Phase.RAMP_IN) is (at < 0 and sample is not None)
+        if at >= 0:
+            assert master._enabling == at
+            # A second from when its turn came: with the cycle in which the one before followed.
+            due = 8.0 + 0.01 * max(at - 1, 0)
+            master._enable(due - 1e-6, events)
+            assert events == []
+            master._enable(due + 1e-3, events)
+            assert [(event.name, event.node) for event in events] == [("enable_timeout", master.bus.drives[at].node)]
+
+
+def test_a_successful_end_is_taken_back_by_the_first_event_after_it() -> None:
+    master = _master(Pilot())
+    master.supervisor.phase = Phase.DONE
+    first, second = Event(1.0, "not_off", 1), Event(2.0, "not_off", 2)
+    for event in (first, second):
+        master.supervisor.revoke(event)
+        assert (master.supervisor.phase, master.supervisor.fault) == (Phase.STOPPED, first)

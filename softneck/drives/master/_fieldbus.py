@@ -139,7 +139,7 @@ class DriveView:
         "silent", "state", "toggle", "word",
     )  # fmt: skip
 
-    def __init__(self, node: int, *, late_mode: bool = False) -> None:
+    def __init__(self, node: int, *, late_mode: bool) -> None:
         """Start with unknown states."""
         self.mode = "missing" if late_mode else "taken"
         self.node = node

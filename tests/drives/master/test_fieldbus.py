@@ -201,3 +201,23 @@ def test_each_cycle_sends_set_points_sync_and_every_other_one_guarding() -> None
 
 def test_the_nodes_are_started_one_by_one() -> None:
     assert Fieldbus(BusSettings(nodes=(4, 5, 6))).start() == [Frame(0, bytes([1, node])) for node in (4, 5, 6)]
+
+
+def test_a_drive_whose_mode_was_refused_is_asked_once_when_it_is_enabled_and_should_be() -> None:
+    """6060h := 8 by SDO (CiA 301, 7.2.4.3.3), to that drive alone; the others go on as before."""
+    order = bytes([0x2F, 0x60, 0x60, 0, 8, 0, 0, 0])
+    for late in (1, 2, 3):
+        bus = Fieldbus(BusSettings(late_modes=(late,)))
+        assert [view.mode for view in bus.drives] == ["missing" if k == late else "taken" for k in (1, 2, 3)]
+
+        def asked(goal: Goal, word: int, bus: Fieldbus = bus) -> list[Frame]:
+            bus.receive(0.0, [tpdo(node, word=word) for node in (1, 2, 3)])
+            return [frame for frame in bus.send((goal,) * 3, (0, 0, 0)) if frame.identifier >> 7 == 0x600 >> 7]
+
+        assert asked(Goal.ENABLED, 0x0631) == asked(Goal.OFF, 0x0637) == []
+        assert not bus.drives[late - 1].follows
+        assert asked(Goal.ENABLED, 0x0637) == [Frame(0x600 + late, order)]
+        assert asked(Goal.ENABLED, 0x0637) == []
+        assert [view.follows for view in bus.drives] == [k != late for k in (1, 2, 3)]
+        bus.receive(0.0, [tpdo(late, word=0x0637), Frame(0x580 + late, bytes([0x60, 0x60, 0x60, 0, 0, 0, 0, 0]))])
+        assert bus.drives[late - 1].follows
