@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 
-from softneck.core import Matrix, SettingsError
+from softneck.core import FileFormatError, Matrix, SettingsError
 from softneck.cosim import make_loop
 from softneck.cosim.parts._fmu_part import drive_fmu
 from softneck.design import PiSettings
@@ -28,6 +28,8 @@ from softneck.identification import (
     OutputError,
     Play,
     SetMembership,
+    embed_model,
+    embedded_model,
     validate,
 )
 from softneck.plant import VirtualNeck
@@ -169,6 +171,36 @@ def test_pressures_and_lengths_keep_their_names_units_and_ranges(
     np.testing.assert_allclose(
         drive_fmu(path, inputs, parameters={"use_measurement": 0.0}), plain(block, 60, **inputs), rtol=1e-9, atol=1e-12
     )
+
+
+@pytest.mark.parametrize("backend", ["python", pytest.param("compiled", marks=native)])
+def test_without_tendons_the_recorded_range_of_outputs_and_half_of_it_is_declared(
+    backend: str, tmp_path: Path, running: Any
+) -> None:
+    rec, chosen = recording(True), model("oe", True)
+    path = built(chosen.block(), tmp_path / "Ranges.fmu", backend, 2)
+    found = variables(path)
+    for name in "xyz":
+        low, high = min(rec.channels[name].min(), 0.0), max(rec.channels[name].max(), 0.0)  # it starts at zero
+        ends = [float(found[name].min), float(found[name].max)]
+        np.testing.assert_allclose(ends, [1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low], rtol=1e-12)
+    assert found["left_position"].max is None
+    most = float(found["x"].max)
+    with running(path) as fmu:
+        fmu.begin(limit_outputs=1.0)
+        fmu.set(left_setpoint=1e5, right_setpoint=1e5)
+        fmu.fmu.doStep(0.0, 50 * TS)
+        assert fmu.get("validity")[0] > 0.0
+        fmu.set(left_setpoint=1e6)
+        fmu.fmu.doStep(50 * TS, 50 * TS)
+        assert fmu.get("x", "validity") == [most, 0.0]
+        assert any("output x = " in text for _, text in fmu.log)
+    before = replace(chosen, findings={k: v for k, v in chosen.findings.items() if k != "outputs_si"})
+    assert all(port.maximum is None for port in before.block().outputs[:3])
+    header, arrays = embed_model(chosen)
+    findings = {**chosen.findings, "outputs_si": {"min": [0.0] * 2, "max": [1.0] * 2}}
+    with pytest.raises(FileFormatError, match="a minimum and a maximum for each motor and output"):
+        embedded_model({**header, "findings": findings}, arrays)
 
 
 def plain(block: Block, rows: int, **inputs: Matrix) -> Matrix:

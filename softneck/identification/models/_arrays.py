@@ -220,6 +220,9 @@ MOST_PAYLOAD = 5.0
 # Range of a winch [rad], for models without a recorded training range.
 _DEFAULT_RANGE_RAD = 6.0
 _RANGE_KEY = "set_points_rad"
+_OUTPUT_RANGE_KEY = "outputs_si"
+# Of a robot without a limit of its own: so much of the recorded range lies beyond each end of it.
+_OUTPUT_MARGIN = 0.5
 
 
 def _output_port(robot: Robot, name: str, description: str, *, missing: bool = False) -> Port:
@@ -268,12 +271,25 @@ def payloads(arrays: Mapping[str, np.ndarray]) -> tuple[float, float] | None:
 
 
 def trained_set_points(*sources: Recording | Mapping[str, Any]) -> dict[str, Any]:
-    """Return the findings on set-points (SI, rest included) and conditions of recordings and of findings of members."""
+    """Return the findings on set-points and outputs (SI, with rest) and conditions of recordings or findings."""
     parts = [s.set_points if isinstance(s, Recording) else np.array(_set_point_range(s, 3)) for s in sources]
-    rows = np.vstack([np.zeros((1, parts[0].shape[1])), *parts])
-    found = {"min": np.nanmin(rows, axis=0).tolist(), "max": np.nanmax(rows, axis=0).tolist()}
+    known = [s.outputs if isinstance(s, Recording) else _output_range(s) for s in sources]
+    outputs = {} if any(rows is None for rows in known) else {_OUTPUT_RANGE_KEY: _range_of(*known)}
     made = [conditions(part) if isinstance(part, Recording) else part.get("conditions", {}) for part in sources]
-    return {_RANGE_KEY: found, "conditions": merge_conditions([part for part in made if part])}
+    return {_RANGE_KEY: _range_of(*parts), **outputs, "conditions": merge_conditions([part for part in made if part])}
+
+
+def _range_of(*parts: Matrix | None) -> dict[str, list[float]]:
+    """Return the smallest and largest values of rows, rest (zero) included."""
+    rows = np.vstack([part for part in parts if part is not None])
+    rows = np.vstack([np.zeros((1, rows.shape[1])), rows])
+    return {"min": np.nanmin(rows, axis=0).tolist(), "max": np.nanmax(rows, axis=0).tolist()}
+
+
+def _output_range(findings: Mapping[str, Any]) -> Matrix | None:
+    """Return the smallest and largest outputs (2, outputs) of the training in SI; None where the findings have none."""
+    limits = findings.get(_OUTPUT_RANGE_KEY)
+    return None if limits is None else np.array([limits["min"], limits["max"]], dtype=np.float64)
 
 
 def trained_range(findings: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
@@ -309,13 +325,21 @@ def _set_point_range(findings: Mapping[str, Any], motors: int) -> tuple[list[flo
 BOUNDED = ("nlsm",)
 
 
-def output_ports(kind: str, robot: Robot) -> tuple[Port, ...]:
-    """Return the outputs of a kind: outputs, motors, the bounds of set membership, and `validity` last."""
+def output_ports(kind: str, robot: Robot, findings: Mapping[str, Any]) -> tuple[Port, ...]:
+    """Return the outputs of a kind: outputs, motors, the bounds of set membership, and `validity` last.
+
+    Outputs without a limit of the robot's own have that of the training, and half of its range beyond.
+    """
     names, tendons = robot.outputs.names, robot.tendon_angles is not None
     texts = [
         f"{name.capitalize()} of the platform" if tendons else f"Output `{name}` of {robot.name}" for name in names
     ]
     ports = [_output_port(robot, name, text) for name, text in zip(names, texts, strict=True)]
+    limits = None if np.isfinite(robot.angle_limit) else _output_range(findings)
+    if limits is not None:
+        (low, high), margin = limits, _OUTPUT_MARGIN * np.ptp(limits, axis=0)
+        ends = zip(ports, (low - margin).tolist(), (high + margin).tolist(), strict=True)
+        ports = [replace(port, minimum=least, maximum=most) for port, least, most in ends]
     for j, name in enumerate(robot.motor_positions, start=1):
         ports.append(_motor_port(robot, name, f"Position of motor {j} by the drive model"))
     for name in names if kind in BOUNDED else ():

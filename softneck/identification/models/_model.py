@@ -94,7 +94,7 @@ class Model(ReprMixin):
             sample_time=self.sample_time,
             arrays=tuple(runtime_arrays(self.kind, self.arrays).values()),
             inputs=input_ports(self.findings, self.robot),
-            outputs=output_ports(self.kind, self.robot),
+            outputs=output_ports(self.kind, self.robot, self.findings),
             parameters=parameter_ports(self.robot, self.arrays),
         )
 
@@ -388,8 +388,11 @@ class Model(ReprMixin):
             raise FileFormatError("its settings and findings must be tables.")
         try:
             input_ports(model.findings, model.robot)
+            output_ports(model.kind, model.robot, model.findings)
         except (KeyError, TypeError, ValueError) as error:
-            raise FileFormatError("its range of set-points must be a minimum and a maximum for each motor.") from error
+            raise FileFormatError(
+                "its ranges of set-points and outputs must be a minimum and a maximum for each motor and output."
+            ) from error
         if model.training_rows.dtype != np.uint64 or model.training_rows.ndim != 1:
             raise FileFormatError("its training rows are not hashes.")
         return model
