@@ -83,6 +83,22 @@ class Neck(Finger):
     def step(self, state, inputs):
         y = 0.9 * state[0] + 0.1 * (self.rest + self.gain * inputs["motor_setpoint_1"])
         return [y], [y, 0.0, *inputs.values()]
+
+
+class Smooth:
+    role, sample_time = "observer", 0.01
+    inputs = {"chamber_setpoint": "Pa", "flexion_measured": "rad"}
+    outputs = {"flexion": "rad", "innovation": "rad"}
+
+    def __init__(self, share):
+        self.share = share
+
+    def initial_state(self):
+        return [0.0]
+
+    def step(self, state, inputs):
+        innovation = inputs["flexion_measured"] - state[0]
+        return [state[0] + self.share * innovation], [state[0] + self.share * innovation, innovation]
 """
 FUNCTIONS = """
 def state_size(arrays):
@@ -215,6 +231,22 @@ def test_a_loop_takes_a_plant_of_ones_own_and_its_fmu(tmp_path: Path, tilt: Modu
     assert ours["pitch"][0] == 0.01
     assert np.ptp(ours["pitch"]) > 0.01
     np.testing.assert_array_equal(ours["pitch"], theirs["pitch"])
+
+
+def test_an_observer_of_ones_own_is_an_fmu_with_its_ports(tmp_path: Path, own_plants: ModuleType) -> None:
+    path = softneck.build_fmu(own_plants.Smooth(0.25), tmp_path / "Smooth.fmu")
+    assert validate_fmu(str(path)) == []
+    named = {v.name: (v.causality, v.unit) for v in fmpy.read_model_description(str(path)).modelVariables}
+    assert named == {
+        "chamber_setpoint": ("input", "Pa"), "flexion_measured": ("input", "rad"), "flexion": ("output", "rad"),
+        "innovation": ("output", "rad"),
+    }  # fmt: skip
+    signals = np.array([(0.0, 0.4), (1.0, 0.4)], dtype=[("time", float), ("flexion_measured", float)])
+    result: Any = fmpy.simulate_fmu(str(path), input=signals, stop_time=0.2, output_interval=0.01)
+    # It answers at once: the estimate of sample k, seen at the end of its step, is 0.4 (1 - 0.75^(k+1)).
+    left = 0.4 * 0.75 ** np.arange(20)
+    np.testing.assert_allclose(result["innovation"][1:], left, rtol=1e-13)
+    np.testing.assert_allclose(result["flexion"][1:], 0.4 - 0.75 * left, rtol=1e-13)
 
 
 @pytest.mark.parametrize(
