@@ -24,16 +24,20 @@ _LONGEST_DELAY = 0.2
 _MEANT, _BENDS = (0.0, 120.0, 240.0), 2
 
 
+def _angles(robot: Robot) -> tuple[float, ...]:
+    return robot.directions.angles_for(robot.outputs.names)
+
+
 def has_own_tendons(robot: Robot) -> bool:
     """Return whether a robot's tendons are at 0, 120 and 240 deg, whose measured angles a neck file holds."""
-    return robot.directions.angles_deg == _MEANT and len(robot.outputs.names) == _BENDS
+    return _angles(robot) == _MEANT and len(robot.outputs.names) == _BENDS
 
 
 def tendons_of(robot: Robot, parameters: NeckParameters) -> tuple[float, ...]:
     """Return the tendon angles of a robot [rad]: from the neck file's measurement, else from its robot file."""
     if has_own_tendons(robot):
         return parameters.tendon_angle_1, parameters.tendon_angle_2, parameters.tendon_angle_3
-    return tuple(math.radians(angle % 360.0) for angle in robot.directions.angles_deg)
+    return tuple(math.radians(angle % 360.0) for angle in _angles(robot))
 
 
 def _inputs(robot: Robot, ranges: Matrix) -> tuple[Port, ...]:
@@ -44,7 +48,7 @@ def _inputs(robot: Robot, ranges: Matrix) -> tuple[Port, ...]:
     )  # fmt: skip
     outputs, shown = robot.outputs.names, robot.outputs.shown
     pushes = ("in the direction of 0 deg", "in the direction of 90 deg")
-    if robot.directions.angles_deg[0] == 0.0:
+    if _angles(robot)[0] == 0.0:
         pushes = ("in the direction of tendon 1", "a quarter turn from tendon 1")
     return (
         *set_points,
@@ -63,7 +67,7 @@ def _inputs(robot: Robot, ranges: Matrix) -> tuple[Port, ...]:
 
 def _outputs(robot: Robot) -> tuple[Port, ...]:
     outputs, motors = robot.outputs.names, range(1, len(robot.motors.names) + 1)
-    first, shown = robot.directions.angles_deg[0] == 0.0, robot.outputs.shown
+    first, shown = _angles(robot)[0] == 0.0, robot.outputs.shown
     towards = ("towards tendon 1", "across it") if first else ("towards 0 deg", "towards 90 deg")
     return (
         *(

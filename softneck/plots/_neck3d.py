@@ -47,7 +47,7 @@ def neck_view(recording: Recording, *, title: str = "The neck") -> str:
         "pull": _round(pulls[keep], 3),
         "unit": "N" if taut else unit,
         "names": run.robot.outputs.names,
-        "tendons": run.robot.directions.angles_deg,
+        "tendons": run.robot.directions.angles_for(run.robot.outputs.names),
         "length": LINK_LENGTH,
         "radius": ATTACHMENT_RADIUS,
     }

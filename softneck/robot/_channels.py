@@ -194,7 +194,8 @@ class Directions:
 
     Attributes:
         kind: "tendons" (by their angles around the axis), "matrix" (as given), "identified" (learned from data).
-        angles_deg: (motors,) angles of the tendons [deg]; 0 bends the first output, 90 the second.
+        angles_deg: (motors,) angles of the tendons [deg]; 0 bends pitch and 90 roll, of other names the first output
+            and the second.
         matrix: (outputs, motors) weights.
         names: of the redefined inputs, one for each output and one for co-contraction; `{output}_input` if not given.
     """
@@ -212,8 +213,14 @@ class Directions:
                 rule = "needs" if self.kind == needed else "takes no"
                 raise SettingsError(f'`directions` of kind = "{self.kind}" {rule} `{key}`.')
 
-    def weights(self) -> Matrix | None:
-        """Return the weights (outputs, motors), up to two rows for tendons; None where they are to be identified.
+    def angles_for(self, outputs: Sequence[str]) -> tuple[float, ...]:
+        """Return (motors,) angles of the tendons [deg] from the direction of the first of `outputs` to the second."""
+        # Files have those of pitch and roll from pitch to roll, whichever is there or first.
+        turned = outputs[0] == "roll" and set(outputs) <= {"pitch", "roll"}
+        return tuple(90.0 - angle for angle in self.angles_deg) if turned else self.angles_deg
+
+    def weights(self, outputs: Sequence[str]) -> Matrix | None:
+        """Return the weights (outputs, motors) of the outputs with these names; None where they are to be identified.
 
         Tendons: cos and sin of their angles, the paper's theta_i and phi_i (Eq. 4, 5).
         """
@@ -221,20 +228,22 @@ class Directions:
             return None
         if self.kind == "matrix":
             return np.array(self.matrix, dtype=np.float64)
-        gamma = np.radians(self.angles_deg)
+        gamma = np.radians(self.angles_for(outputs))
         rows = np.array([np.cos(gamma), np.sin(gamma)])
         rows[np.abs(rows) < 1e-15] = 0.0
-        return rows
+        return rows[: len(outputs)]
 
-    def check(self, motors: int, outputs: int) -> None:
-        """Raise SettingsError unless the directions have these numbers of motors and outputs, and span the outputs."""
-        self._check_weights(motors, outputs)
-        if self.names and len(self.names) != outputs + 1:
+    def check(self, motors: int, names: Sequence[str]) -> None:
+        """Raise SettingsError unless the directions have so many motors and these outputs, and span the outputs."""
+        self._check_weights(motors, names)
+        if self.names and len(self.names) != len(names) + 1:
             raise SettingsError(
-                f"`directions.names` must name {outputs} redefined input(s) and co-contraction; got {len(self.names)}."
+                f"`directions.names` must name {len(names)} redefined input(s) and co-contraction; got "
+                f"{len(self.names)}."
             )
 
-    def _check_weights(self, motors: int, outputs: int) -> None:
+    def _check_weights(self, motors: int, names: Sequence[str]) -> None:
+        outputs = len(names)
         if self.kind == "identified":
             return
         if self.kind == "tendons":
@@ -242,13 +251,10 @@ class Directions:
         elif len(self.matrix) != outputs or any(len(row) != motors for row in self.matrix):
             got = f"{len(self.matrix)} x {'/'.join(str(n) for n in sorted({len(row) for row in self.matrix}))}"
             raise SettingsError(f"`directions.matrix` must be outputs x motors, {outputs} x {motors}; got {got}.")
-        weights = self.weights()
+        weights = self.weights(names)
         if weights is None:
             return
-        if (
-            np.linalg.svd(weights[:outputs], compute_uv=False)[min(outputs, motors) - 1] < _MIN_SINGULAR_VALUE
-            or motors < outputs
-        ):
+        if np.linalg.svd(weights, compute_uv=False)[min(outputs, motors) - 1] < _MIN_SINGULAR_VALUE or motors < outputs:
             what = f"tendons at {', '.join(f'{a:g}' for a in self.angles_deg)} deg" if self.angles_deg else "the matrix"
             raise SettingsError(
                 f'`directions`: {what} cannot span {outputs} output(s); fix them, or write kind = "identified".'

@@ -109,7 +109,7 @@ class Robot(ReprMixin):
     def __post_init__(self) -> None:
         if not self.name.strip() or not self.name.isprintable():
             raise SettingsError(f"`name` must be one line of text; got {self.name!r}.")
-        self.directions.check(len(self.motors.names), len(self.outputs.names))
+        self.directions.check(len(self.motors.names), self.outputs.names)
         units = {"sample_time_s": "s", "time_constant_s": "s", "winch_radius_m": "m", "rate_hz": "1/s"}
         for key, unit in units.items():
             if (value := getattr(self, key)) is not None:
@@ -224,8 +224,7 @@ class Robot(ReprMixin):
 
     def weights(self) -> Matrix | None:
         """Return the weights (outputs, motors) of the motors in each output's direction; None: to be identified."""
-        weights = self.directions.weights()
-        return None if weights is None else weights[: len(self.outputs.names)]
+        return self.directions.weights(self.outputs.names)
 
     @property
     def input_names(self) -> tuple[str, ...]:
@@ -239,8 +238,9 @@ class Robot(ReprMixin):
 
     @property
     def tendon_angles(self) -> Vector | None:
-        """(motors,) angles of the tendons [rad]; None for a robot without tendons at known angles."""
-        return np.radians(self.directions.angles_deg) if self.directions.kind == "tendons" else None
+        """(motors,) angles of the tendons from the first output [rad]; None without tendons at known angles."""
+        angles = self.directions.angles_for(self.outputs.names)
+        return np.radians(angles) if self.directions.kind == "tendons" else None
 
     @property
     def angle_limit(self) -> float:

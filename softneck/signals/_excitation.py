@@ -77,7 +77,7 @@ class PullDirections:
     def of(cls, robot: Robot) -> PullDirections:
         """Return the directions of a robot."""
         motors, outputs = len(robot.motors.names), len(robot.outputs.names)
-        angles = np.radians(robot.directions.angles_deg or np.arange(motors) * 360.0 / motors)
+        angles = np.radians(robot.directions.angles_for(robot.outputs.names) or np.arange(motors) * 360.0 / motors)
         weights = robot.weights()
         if weights is None:  # unknown directions: waves around the axis, one for each output
             weights = np.cos(

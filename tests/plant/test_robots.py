@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, Matrix, SettingsError
-from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.plant import NeckParameters, VirtualNeck, record, tendons_of
 from softneck.robot import Robot
 from softneck.runtime import Block, State, load_runtime
 from softneck.signals import Excitation, signal, signal_names
@@ -126,6 +126,14 @@ def test_one_axis_stays_in_its_plane() -> None:
     assert [port.name for port in block.outputs[:4]] == [
         "bend", "bend_measured", "bend_rate_measured", "measurement_valid",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("names", [("roll",), ("roll", "pitch"), ("pitch",), ("pitch", "roll")])
+def test_the_plant_s_tendons_stand_where_the_robot_has_its_directions(names: tuple[str, ...]) -> None:
+    one = robot(3, len(names), turn=10.0, outputs={**Robot.preset().as_dict()["outputs"], "names": names})
+    angles = np.array(tendons_of(one, quiet()))
+    # The plant bends its first output by cosines and its second by sines, which weights round at 1e-15.
+    np.testing.assert_allclose(np.array([np.cos(angles), np.sin(angles)])[: len(names)], one.weights(), atol=1e-14)
 
 
 @pytest.mark.parametrize(("motors", "outputs"), SIZES)

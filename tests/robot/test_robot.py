@@ -63,6 +63,24 @@ def test_the_neck_is_the_paper_s() -> None:
     assert neck.winch_radius_m == paper.winch_radius
 
 
+def test_roll_has_its_own_direction_without_pitch_or_before_it() -> None:
+    neck = Robot.preset()
+    table = {name: dict(part) for name, part in neck.as_dict().items() if name in ("motors", "outputs", "directions")}
+    table["directions"].pop("names")
+
+    def of(*names: str) -> np.ndarray:
+        return weights_of(Robot.from_dict({**table, "name": "n", "outputs": {**table["outputs"], "names": [*names]}}))
+
+    both = weights_of(neck)
+    np.testing.assert_array_equal(of("pitch", "roll"), both)
+    # Of the cosines of the complements 1e-15 is rounding.
+    np.testing.assert_allclose(of("roll"), both[1:], atol=1e-15)
+    np.testing.assert_allclose(of("roll", "pitch"), both[::-1], atol=1e-15)
+    # Other names have their place in the file alone.
+    np.testing.assert_array_equal(of("bend"), both[:1])
+    np.testing.assert_array_equal(of("roll", "yaw"), both)
+
+
 def test_tendons_pull_along_their_angles() -> None:
     np.testing.assert_allclose(weights_of(Robot.preset("antagonist")), [[1.0, -1.0]])
     np.testing.assert_allclose(weights_of(Robot.preset("trunk4")), [[1, 0, -1, 0], [0, 1, 0, -1]], atol=1e-15)

@@ -230,7 +230,7 @@ def _rest(neck: VirtualNeck) -> float:
 def _tilt(neck: VirtualNeck) -> float:
     """Return how far the neck tilts when its tendons are moved as Eq. 9 and 10 have it, without payload [rad]."""
     # Along the first output's direction, so that the motors come to as much together.
-    meant = np.cos(np.radians(neck.robot.directions.angles_deg))
+    meant = np.cos(np.radians(neck.robot.directions.angles_for(neck.robot.outputs.names)))
     P: Vector = _GAIN_AMPLITUDE_RAD / np.dot(meant, meant) * np.cos(tendons_of(neck.robot, neck.parameters))
     out = settle(neck.block(), P).outputs
     return math.hypot(*(float(angle) for angle in out[: len(neck.robot.outputs.names)]))

@@ -246,12 +246,12 @@ def _late(Y: Matrix, delay: float) -> Matrix:
 
 def _tendons(robot: Robot) -> Vector:
     """Return share, cosines and sines of the tendons for the equations; empty for three 120 deg apart."""
-    axes, angles = len(robot.outputs.names), robot.directions.angles_deg
+    axes, angles = len(robot.outputs.names), robot.directions.angles_for(robot.outputs.names)
     if axes == 2 and len(angles) == 3 and np.allclose(np.mod(angles, 360.0), [0.0, 120.0, 240.0]):
         return np.zeros(0)
-    weights = robot.directions.weights()
+    weights = robot.weights()
     e = np.zeros((2, len(robot.motors.names)))
-    e[:axes] = 0.0 if weights is None else weights[:axes]
+    e[:axes] = 0.0 if weights is None else weights
     largest = float(np.linalg.norm(e, 2)) ** 2
     return np.concatenate([[min(largest / e.shape[1], 1.0)], e.ravel()])
 
