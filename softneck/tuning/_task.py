@@ -69,11 +69,11 @@ class Task:
 
     @property
     def bounds(self) -> tuple[Requirement, ...]:
-        """Requirements of the search: where draws decide, linear margins only where they are stated."""
-        linear = ("axes.", "mimo.", "robust.", "stability.")
+        """Requirements of the search: where draws decide, of linear ones those stated, the margins and the load."""
+        linear, kept = ("axes.", "mimo.", "robust.", "stability.", "step."), (*MARGINS, "step.load_rms_")
         return tuple(
             item for item in self.asked.bounds
-            if not self.drawn or item.asked or item.metric in MARGINS or not item.metric.startswith(linear)
+            if not self.drawn or item.asked or item.metric.startswith(kept) or not item.metric.startswith(linear)
         )  # fmt: skip
 
     @property

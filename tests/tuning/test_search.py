@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,10 @@ from softneck.plant import NeckParameters
 from softneck.robot import Robot
 from softneck.tuning import task_of, tune
 from softneck.tuning._judge import cases, judged_delay, told_conditions
+from softneck.tuning._requirements import make_tune_requirements
 from softneck.tuning._search import Candidate, ratio, run_jobs
 from softneck.tuning._space import KINDS_SEARCHED, spaces
-from softneck.tuning._task import _LOG_FORMAT, FILE, Job, Log
+from softneck.tuning._task import _LOG_FORMAT, FILE, Job, Log, Task
 from softneck.tuning._tune import Tuned, active_requirement, front
 from softneck.verification import make_simulation_model
 from softneck.verification._requirements import Requirement
@@ -375,6 +377,29 @@ def test_what_is_known_twice_counts_by_the_worse() -> None:
     assert item.metrics["axes.gain_margin"] == 1.8
     item.update("margins", Judgement({"axes.gain_margin": 4.0}))
     assert item.metrics["axes.gain_margin"] == 1.8
+
+
+def test_where_draws_decide_a_search_is_not_led_by_linear_requirements() -> None:
+    def led_by(drawn: tuple[str, ...], require: dict[str, Any]) -> set[str]:
+        task: Any = SimpleNamespace(asked=make_tune_requirements({"require": require}), drawn=drawn)
+        return {item.metric for item in Task.bounds.fget(task)}  # pyright: ignore[reportOptionalCall]
+
+    every, led = led_by((), {}), led_by(("draw",), {})
+    shown = {
+        "stability.radius",
+        "axes.sensitivity",
+        "mimo.disk_margin",
+        "robust.mu",
+        "step.overshoot_pct",
+        "step.settling_s",
+    }
+    assert shown <= every
+    assert led < every
+    assert not shown & led
+    # No loop of the search tells the error under a load; margins come before loops.
+    assert {"axes.gain_margin", "axes.delay_margin_ms", "step.load_rms_deg", "sim.rise_s", "track.ahead_rms_deg"} <= led
+    # What somebody states counts.
+    assert led_by(("draw",), {"step.overshoot_pct": {"max": 9.0}}) == led | {"step.overshoot_pct"}
 
 
 @pytest.mark.slow

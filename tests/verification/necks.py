@@ -81,6 +81,6 @@ def small_draws() -> Draws:
     rows = [source.arrays(source.draw(rng), 1.0) for _ in range(SEARCH_DRAWS + 4 * COUNT)]
     return Draws(
         model=source.model, arrays={"weights": np.array([row["weights"] for row in rows])}, count=COUNT, seed=0,
-        factor=1.0, share=np.full(2, 0.01), keep=0.9, level=0.95, coverage=[],
+        factor=1.0, share=np.full(2, 0.01), keep=0.9, noise=np.zeros(2), level=0.95, coverage=[],
         conditions={"payload_kg": [0.0, 0.0], "cocontraction": [0.0, 0.0], "motion": [0.3, 0.3]},
     )  # fmt: skip
