@@ -417,3 +417,55 @@ def test_draws_that_a_search_sees_are_in_no_certificate_and_decide_for_linear_ma
     assert not [name for name in told if "neck, draw" in name]
     seen = {model.arrays["weights"].tobytes() for model in draws.for_search()}
     assert not seen & {model.arrays["weights"].tobytes() for model in draws.for_certificate(part.attempt)}
+
+
+# What is searched of each kind: (setting, lowest, highest, start). Ms of 3 leaves a gain margin of 1.5, Ms of 1.15 one
+# of 7.7; phase margins are what those of the kind are designed for.
+DEGREE = math.radians(1.0)
+SEARCHED = {
+    "pi": [("max_sensitivity", 1.15, 2.5, 1.5), ("phase_margin", 40 * DEGREE, 80 * DEGREE, 1.05)],
+    "pid": [("max_sensitivity", 1.2, 3.0, 1.5), ("noise_gain", 2.0, 10.0, 5.0)],
+    "fopi": [("max_sensitivity", 1.2, 3.0, 1.5), ("phase_margin", 60 * DEGREE, 100 * DEGREE, 1.4)],
+    "hinf": [("max_sensitivity", 1.2, 3.0, 1.5), ("control_weight", 0.05, 1.0, 0.3)],
+    "lqg": [("max_sensitivity", 1.2, 3.0, 1.4), ("control_weight", 0.01, 1.0, 0.06), ("input_noise", 1.0, 100.0, 5.0)],
+    "adaptive": [("max_sensitivity", 1.15, 2.0, 1.5), ("phase_margin", 0.7, 1.4, 1.05)],
+    "mpc": [("max_sensitivity", 1.2, 2.5, 1.5)],
+    "nmpc": [],
+}
+
+
+@pytest.mark.parametrize("kind", SEARCHED)
+@pytest.mark.parametrize("least", [0.0, 0.3, 9.0])
+def test_what_is_searched_of_a_kind_has_its_range_and_its_start(kind: str, least: float) -> None:
+    """Speeds are in parts of the rise that is asked, and no shorter than the motors allow."""
+    robot, rise = Robot.preset("neck"), 0.5
+    (space,) = spaces((kind,), rise=rise, cocontraction=0.7, robot=robot, least=least)
+    found = [(item.name, item.low, item.high, item.start) for item in space.dimensions]
+    short = min(least, rise)
+    linear = kind not in ("adaptive", "mpc", "nmpc")
+    speed = (
+        [("reference_time", 0.05 * rise, 0.6 * rise, 0.25 * rise), ("lead", 0.2, 2.5, 1.0)] if linear
+        else [("rise_s", max(0.3 * rise, 1.03 * short), 1.2 * rise, max(0.42 * rise, 1.03**2 * short))]
+    )  # fmt: skip
+    ahead = [("lead_limit", 0.4, 2.0, 0.8)] if kind in ("mpc", "nmpc") else []
+    assert [row[0] for row in found] == [row[0] for row in (*speed, *SEARCHED[kind], *ahead)]
+    for row, expected in zip(found, (*speed, *SEARCHED[kind], *ahead), strict=True):
+        assert row[1:] == pytest.approx(expected[1:])
+    for item in space.dimensions:
+        assert 0.0 < item.start_part < 1.0
+        assert (item.value(0.0), item.value(1.0)) == pytest.approx((item.low, item.high), rel=1e-3)
+        assert item.value(item.start_part) == pytest.approx(item.start, rel=1e-3)
+        assert item.value(0.5) == pytest.approx(math.sqrt(item.low * item.high), rel=1e-3)
+        assert (item.value(-1.0), item.value(2.0)) == (item.value(0.0), item.value(1.0))
+    names = [item.name for item in space.dimensions]
+    assert space.trade_off == (names.index("max_sensitivity") if "max_sensitivity" in names else None)
+    pulls = {"mpc": {}, "nmpc": {"minimum_tautness": 0.7}}.get(kind, {"least_cocontraction": 0.7})
+    assert {key: value for key, value in space.fixed.items() if key != "lead_limit"} == pulls
+    assert ("lead_limit" in space.fixed) is (not ahead)
+    assert space.fixed.get("lead_limit", 0.6) == pytest.approx(0.6)
+    settings = space.settings(space.start)
+    if linear:
+        assert settings["reference_time"] == pytest.approx([0.25 * rise, 1.0], rel=1e-3)
+        assert "lead" not in settings
+    (free,) = spaces((kind,), rise=rise, cocontraction=None, robot=robot)
+    assert set(free.fixed) <= {"lead_limit"}
