@@ -38,8 +38,8 @@ def _results(digest: str) -> list[Any]:
 def content_digest(*things: Any) -> str | None:
     """Return the SHA-256 of numbers, texts, arrays, and of tables, lists and dataclasses of them.
 
-    A whole number counts as the float of the same value, and a tuple as a list. None if a part has no content that can
-    be compared, such as a function.
+    A whole number counts as the float of the same value, a tuple as a list, a field with the metadata `content` False
+    not at all. None if a part has no content that can be compared, such as a function.
     """
     found = hashlib.sha256()
     try:
@@ -73,6 +73,7 @@ def _parts(thing: Any) -> Iterator[bytes]:
         case _ if is_dataclass(thing) and not isinstance(thing, type):
             yield type(thing).__qualname__.encode()
             for item in fields(thing):
-                yield from _parts(getattr(thing, item.name))
+                if item.metadata.get("content", True):
+                    yield from _parts(getattr(thing, item.name))
         case _:
             raise TypeError(type(thing).__name__)

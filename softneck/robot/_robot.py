@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -104,7 +104,7 @@ class Robot(ReprMixin):
     rate_hz: float | None = None
     neck: str | None = None
     drives: str | None = None
-    file: Path | None = None
+    file: Path | None = field(default=None, metadata={"content": False})
 
     def __post_init__(self) -> None:
         if not self.name.strip() or not self.name.isprintable():

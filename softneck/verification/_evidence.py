@@ -106,17 +106,27 @@ def gather(
     """
     drawn = draws_of(families)
 
-    def compute() -> Evidence:
-        return _without_draws(
-            controller, necks, asked, observer=observer, progress=progress, families=families, own=own, overall=overall
-        )
-
     # Margins of single axes are only computed if required.
     alone = {f"{axis}.{name}" for axis in controller.robot.outputs.names for name in ("gain_margin", "delay_margin_ms")}
     overall = all(item.metric not in alone for item in asked.bounds)
-    made_of = (controller, necks, asked.tables, observer, families, [(m.name, m.thing) for m in own], overall)
-    # The built-in plant may be a file, which may have changed.
-    found = compute_once(compute, *made_of) if own or drawn else compute()
+    plants = [(plant.name, plant.thing) for plant in own]
+
+    def linear() -> Evidence:
+        return _linear_evidence(controller, necks, asked, progress, families)
+
+    def simulated() -> tuple[list[LoopRun], list[Crossing]]:
+        return _simulated(controller, asked, observer=observer, progress=progress, own=own, overall=overall)
+
+    found = compute_once(linear, controller, necks, asked.tables, families)
+    if own:
+        runs, crossed = compute_once(simulated, controller, asked.tables, observer, plants, overall)
+    elif drawn or why_no_virtual_plant(controller.robot, asked):
+        runs, crossed = [], []
+    else:  # the built-in plant may be a file, which may have changed
+        runs, crossed = simulated()
+    # A built-in plant does not count unless the user gives its file.
+    foreign = not (own or drawn or asked.sim["decides"] or preset_of(asked).endswith(".toml"))
+    found = replace(found, necks=runs, crossings=crossed, foreign=foreign)
     evidence = replace(found, metrics={}, not_computed={}, drawn=[])
     why = why_no_virtual_plant(controller.robot, asked)
     evidence.not_computed.update({"sim": why} if why and not own else judged_elsewhere(own, asked))
@@ -136,12 +146,12 @@ def gather(
     return evidence
 
 
-def _without_draws(
-    controller: ControllerUnderTest, necks: Sequence[PlantSource], asked: Requirements, *, observer: Block | None,
-    progress: Progress, families: Mapping[str, Any], own: Sequence[SimulationModel], overall: bool,
+def _linear_evidence(
+    controller: ControllerUnderTest, necks: Sequence[PlantSource], asked: Requirements, progress: Progress,
+    families: Mapping[str, Any],
 ) -> Evidence:  # fmt: skip
-    """Compute what neither limits nor draws change; `overall`: no margin of a single axis is required."""
-    sources, seed, drawn = list(necks), int(asked.sampling["seed"]), draws_of(families)
+    """Compute what no loop over a simulation model changes, and no observer in it."""
+    sources, seed = list(necks), int(asked.sampling["seed"])
     base = all_plants(sources, int(asked.sampling["plants"]), seed)
     plants = base.later(controller.extra)
     w = frequency_grid(base.sample_time, asked.scale.time)
@@ -153,19 +163,25 @@ def _without_draws(
     stepped = join([plants, *(part.plants.take(np.arange(len(plants), len(part.plants))) for part in linear)])
     test, weights = asked.step_test(seed), sources[0].weights
     steps = run_steps(stepped, controller.block, test, robot=controller.robot, weights=weights)
-    runs = run_loops(
-        controller.block, asked, order=controller.order, observer=observer, seed=seed,
-        progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
-    ) if own or not (why_no_virtual_plant(controller.robot, asked) or drawn) else []  # fmt: skip
-    loops = loops_under_test(controller.block, own, asked, order=controller.order, observer=observer)
-    late = lambda done, text: progress(0.8 + 0.2 * done, text)  # noqa: E731
-    found = crossings(loops, overall=overall, progress=late) if loops else []
     steep = float(asked.uncertainty["rolloff_db_per_decade"])
     laws = controller.laws.values()
     tested = [item for law in laws for item in data_margins(families, law, plants.axes, controller.extra, steep)]
-    # A built-in plant does not count unless the user gives its file.
-    foreign = not (own or drawn or asked.sim["decides"] or preset_of(asked).endswith(".toml"))
-    return Evidence(plants, w, linear, steps, stepped, runs, foreign=foreign, tested=tested, crossings=found)
+    return Evidence(plants, w, linear, steps, stepped, [], tested=tested)
+
+
+def _simulated(
+    controller: ControllerUnderTest, asked: Requirements, *, observer: Block | None, progress: Progress,
+    own: Sequence[SimulationModel], overall: bool,
+) -> tuple[list[LoopRun], list[Crossing]]:  # fmt: skip
+    """Run the loops over simulation models, and their margins; `overall`: none of a single axis is required."""
+    seed = int(asked.sampling["seed"])
+    runs = run_loops(
+        controller.block, asked, order=controller.order, observer=observer, seed=seed,
+        progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
+    )  # fmt: skip
+    loops = loops_under_test(controller.block, own, asked, order=controller.order, observer=observer)
+    late = lambda done, text: progress(0.8 + 0.2 * done, text)  # noqa: E731
+    return runs, crossings(loops, overall=overall, progress=late) if loops else []
 
 
 def _linear(

@@ -13,7 +13,15 @@ import numpy as np
 import pytest
 
 from softneck.cli._main import run
-from softneck.core import CheckFailedError, FileFormatError, SettingsError, check_certificate, load, read_certificate
+from softneck.core import (
+    CheckFailedError,
+    FileFormatError,
+    SettingsError,
+    check_certificate,
+    content_digest,
+    load,
+    read_certificate,
+)
 from softneck.cosim import load_loop, simulate
 from softneck.design import LinearController
 from softneck.loop import BlockPart, Loop, StepReference, run_loop
@@ -27,6 +35,7 @@ from softneck.verification import (
     verification_page,
     verify,
 )
+from softneck.verification._linear import controller_under_test
 from softneck.verification._plants import all_plants, source_of_family
 from softneck.verification._steps import StepTest, run_steps
 
@@ -60,6 +69,17 @@ def files(tmp_path: Path) -> dict[str, Path]:
     family().save(paths["family"])
     paths["asked"].write_text(QUICK_TOML.format(sensitivity=2.5), encoding="utf-8")
     return paths
+
+
+def test_what_is_loaded_has_the_content_of_what_was_saved(files: dict[str, Path]) -> None:
+    # `start` verifies files of what `tune` has verified in memory: equal loops are then not run again.
+    saved, loaded = ((pi(), family()), (load(files["controller"]), load(files["family"])))
+    digests = [
+        [content_digest(controller_under_test(c, order=None, observer=False)), content_digest(f)]
+        for c, f in (saved, loaded)
+    ]
+    assert digests[0] == digests[1]
+    assert None not in digests[0]
 
 
 @pytest.mark.slow
