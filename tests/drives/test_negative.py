@@ -498,6 +498,14 @@ def test_a_sample_is_logged_once_with_the_set_points_that_were_sent_to_its_end()
         log(0.005 * cycle, (), (), None, master)  # pyright: ignore[reportArgumentType]
     assert [row["motor_setpoint_1"] for row in logged] == [0.1 * 3, 0.1 * 7]
     assert log.rows == 2
+    # Each with the number of its run; alone it is the first.
+    assert [row["run"] for row in logged] == [1.0, 1.0]
+    logged.clear()
+    numbered = SignalLog(3, run=np.array([4, 5, 6]), session=told)  # pyright: ignore[reportArgumentType]
+    for cycle in range(12):
+        master.index = cycle // 4
+        numbered(0.005 * cycle, (), (), None, master)  # pyright: ignore[reportArgumentType]
+    assert [row["run"] for row in logged] == [4.0, 5.0, 6.0]
 
 
 def test_rows_are_kept_in_the_folder_of_the_session_and_without_one_where_temporary_files_are(

@@ -327,3 +327,35 @@ def test_an_oscillation_is_heard_above_a_share_of_the_step_and_twice_the_floor(
                 monkeypatch.setattr(Experiment, "_windows", lambda _, *at, w=(before, last): asked.append(at) or w)
                 assert made.try_at(4.0, floor) == (heard and sustained, last)
     assert set(asked) == {{"gain_up": (4.0, 0.0), "gain_down": (0.25, 0.0), "delay": (1.0, 4.0 / TS)}[what]}
+
+
+def test_an_experiment_in_the_units_of_its_robot() -> None:
+    """Steps of 1 and 8 deg of a neck, the small one no smaller than the noise asks for; delays in samples of a neck."""
+
+    def loop(names: tuple[str, ...] = ("a",), Ts: float = TS, **more: float) -> LoopUnderTest:
+        robot: Any = SimpleNamespace(outputs=SimpleNamespace(names=names))
+        controller: Any = SimpleNamespace(sample_time=Ts)
+        return LoopUnderTest(name="x", plant=lambda: None, controller=controller, robot=robot, **more)  # pyright: ignore
+
+    deg = math.radians(1.0)
+    assert loop().kicks == pytest.approx((deg, 8.0 * deg))
+    assert loop(size=3.0).kicks == pytest.approx((3.0 * deg, 24.0 * deg))
+    assert loop(size=3.0, noise=5.0).kicks == pytest.approx((5.0 * deg, 24.0 * deg))
+    assert loop(size=3.0, noise=30.0).kicks == pytest.approx((24.0 * deg,))
+    assert loop(noise=0.1).kicks == pytest.approx((deg, 8.0 * deg))
+    for Ts, scale, samples in ((0.02, 1.0, 1), (0.005, 1.0, 4), (0.02, 3.0, 3), (0.5, 1.0, 1), (0.01, 0.1, 1)):
+        assert loop(Ts=Ts, time=scale).samples == samples
+    for names, postures in (
+        (("a",), [(0.0,), (5.0,), (-5.0,)]), (("a", "b"), [(0.0, 0.0), (5.0, 0.0), (0.0, -5.0)]),
+        (("a", "b", "c"), [(0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (0.0, 0.0, -5.0)]),
+    ):  # fmt: skip
+        assert loop(names).outputs == names
+        np.testing.assert_allclose(np.degrees(loop(names).postures()), postures)
+    assert pytest.approx([2.0 ** (k / 4.0) for k in range(1, 17)]) == _experiments.GAIN_SCAN
+    assert pytest.approx(_experiments.GAIN_SCAN[1::2]) == _experiments._COARSE_GAINS
+    assert all(later / before <= 2.0 for before, later in pairwise(_experiments.DELAY_SCAN))
+    assert (_experiments.DELAY_SCAN[0], _experiments.DELAY_SCAN[-1]) == (1.0, 32.0)
+    assert _experiments.DELAY_SCAN[-1] + 2 <= _experiments._BUFFER_SAMPLES
+    for hunting, rests in ((0.99, True), (1.0, True), (1.01, False), (math.nan, False), (math.inf, False)):
+        case = Experiment(loop(size=2.0), "both", "delay", 0.1, (0.0,))
+        assert case.comes_to_rest(2.0 * deg * hunting) is rests

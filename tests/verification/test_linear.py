@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import control
 import numpy as np
 import pytest
 
+from softneck.core import SettingsError
 from softneck.design import FopiSettings, PiSettings, mu_upper
 from softneck.design.robust._mu import two_scalars
 from softneck.estimation import LinearNeck
 from softneck.identification.models._linear_systems import remove_unreachable_states
 from softneck.loop import BlockPart
 from softneck.verification import linear_plant
-from softneck.verification._linear import LinearLaw, frequency_grid, inverse, margins, radii
+from softneck.verification._linear import AxisMargins, LinearLaw, frequency_grid, inverse, margins, radii
 from softneck.verification._plants import (
     AxisBox,
     Plants,
@@ -305,3 +307,44 @@ def test_measured_outputs_have_noise_of_the_stated_size_and_none_at_zero() -> No
             for axis in (2, 3):
                 # The deviation of 2,000 draws is known to 1.6 %; three of that.
                 assert np.std(rows[:, axis]) == pytest.approx(std, rel=0.05, abs=0.0)
+
+
+@pytest.mark.parametrize("dt", [0, None, True])
+def test_a_linear_form_says_how_often_it_runs(dt: Any) -> None:
+    names: dict[str, Any] = {
+        "inputs": ["pitch_reference", "roll_reference", "pitch", "roll"],
+        "outputs": ["theta_i", "phi_i"],
+    }
+    rng = np.random.default_rng(0)
+    numbers = 0.3 * np.eye(2), rng.normal(size=(2, 4)), rng.normal(size=(2, 2)), rng.normal(size=(2, 4))
+    law = LinearLaw.of(control.StateSpace(*numbers, TS, **names))
+    assert law.sample_time == TS
+    for part, expected in zip((law.A, law.Br, law.By, law.C, law.Dr, law.Dy),
+                              (numbers[0], numbers[1][:, :2], numbers[1][:, 2:], numbers[2], numbers[3][:, :2],
+                               numbers[3][:, 2:]), strict=True):  # fmt: skip
+        np.testing.assert_array_equal(part, expected)
+    with pytest.raises(SettingsError, match="must be discrete, with its sample time as dt"):
+        LinearLaw.of(control.StateSpace(*numbers, dt, **names))
+    with pytest.raises(SettingsError, match="is a ndarray, not a python-control system"):
+        LinearLaw.of(numbers[0])
+    for what, swapped in (("inputs", [1, 0, 2, 3]), ("inputs", [0, 1, 3, 2]), ("outputs", [1, 0])):
+        other = names | {what: [names[what][k] for k in swapped]}
+        with pytest.raises(SettingsError, match=r"the controller goes from .* softneck verifies one from pitch_ref"):
+            LinearLaw.of(control.StateSpace(*numbers, TS, **other))
+
+
+@pytest.mark.parametrize(
+    ("crossover", "unheard", "band", "told"),
+    [
+        (5.0, (), (1.0, 20.0), ""), (math.inf, (), (1.0, 20.0), r"from 1 to 20 rad/s, and .* `multisine --band 6,60`"),
+        (math.inf, (), (8.0, 20.0), "--band 8,60"),
+        (5.0, ("a.csv", "b.csv"), (1.0, 20.0), r"does not respond in a\.csv of f"),
+        (math.inf, ("a.csv",), (1.0, 20.0), r"does not respond in a\.csv"),
+    ],
+)  # fmt: skip
+def test_an_axis_says_what_its_data_do_not_support(
+    crossover: float, unheard: tuple[str, ...], band: tuple[float, float], told: str
+) -> None:
+    found = AxisMargins(source="f", axis="pitch", band=band, crossover=crossover, margins={}, mu=0.5, at={},
+                        unheard=unheard)  # fmt: skip
+    assert re.search(told, found.why()) if told else found.why() == ""

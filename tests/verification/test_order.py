@@ -173,6 +173,16 @@ def test_a_verification_holds_where_none_fails_and_counts_what_is_not_computed(h
     assert said["files"] == {"controller": {"path": "pi.npz", "sha256": "a" * 64}}
     assert "attempts" not in said
     assert found.contents(attempts={"tried": []})["attempts"] == {"tried": []}
+    assert {"robot", "scale"}.isdisjoint(said)
+    # Of another robot it says whose, and by what the defaults were stretched.
+    other = Robot.preset("antagonist")
+    under.robot = other
+    scale = Scale(robot=other, time=3.0, size=2.0)
+    found = Verification(verdicts=verdicts, evidence=evidence, controller=under, necks=[],
+                         requirements=make_requirements({}, scale=scale))  # fmt: skip
+    said = found.contents()
+    assert said["robot"] == {"name": "antagonist", "hash": other.hash}
+    assert said["scale"] == {"time": 3.0, "size": 2.0}
 
 
 def test_the_validity_of_a_certificate_is_the_narrowest_of_its_families_and_the_least_of_its_margins() -> None:
