@@ -38,8 +38,8 @@ SEARCH_DRAWS, ATTEMPTS = 8, 4
 LEVEL = 0.95
 # Last part of each run, held out from the fit; rows of each run that are used at most [s of a neck's time].
 _HELD_OUT, _MOST_S = 0.25, 60.0
-# Segments of held-out motions [s of a neck's time], and least rows of one.
-_SEGMENT_S, _LEAST_ROWS = 2.0, 20
+# Segments of held-out motions: usual, shortest (10, 2.5 time constants) [s of a neck's time], least rows of one.
+_SEGMENT_S, _LEAST_SEGMENT_S, _LEAST_ROWS = 2.0, 0.5, 20
 # Factors on the deviations of the fit, of which the sharpest that explain the held-out motions are taken.
 _FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 _CALIBRATION_DRAWS = 40
@@ -279,8 +279,11 @@ class _Motions:
 
     @classmethod
     def of(cls, held: Recording, model: Model, second: float) -> _Motions:
-        length, groups, first = max(_LEAST_ROWS, round(_SEGMENT_S * second / held.sample_time)), [], 0
-        for run in held.runs():
+        usual, least = (round(length * second / held.sample_time) for length in (_SEGMENT_S, _LEAST_SEGMENT_S))
+        runs, groups, first = held.runs(), [], 0
+        # One run that is shorter than a segment has two halves.
+        length = max(_LEAST_ROWS, usual if len(held) > usual else max(least, (len(held) + 1) // 2))
+        for run in runs:
             number = first + np.arange(len(run)) // length
             number[:WARM_UP] = -1
             first = int(number.max(initial=first)) + 1

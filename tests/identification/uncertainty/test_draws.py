@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.core import FileFormatError, SettingsError, load
+from softneck.core import DataError, FileFormatError, SettingsError, load
 from softneck.identification import Draws, Family, Model, make_draws
 from softneck.identification.structured._play import Play
 from softneck.identification.structured._play_draws import PlayDraws
@@ -161,3 +161,18 @@ def test_draws_of_a_neck_are_grey_boxes_that_cover_a_new_recording() -> None:
     for row in motions.coverage(Y, found.share, found.keep):
         # A tenth less than the level: twenty draws have a narrower range than the forty of the calibration.
         assert row["covered"] >= found.level - 0.1
+
+
+@pytest.mark.parametrize(("second", "rows"), [(1.0, 100), (4.17, 128), (6.0, 150)])
+def test_one_short_run_of_a_slow_robot_has_two_segments_at_least(second: float, rows: int) -> None:
+    """A tank of 208 s time constant at 4 s a sample: 256 rows held out, where a usual segment has 417."""
+    motions = _draws._Motions.of(neck_recording(256), Model(kind="rls", sample_time=0.02, arrays={}), second)
+    found, counts = np.unique(motions.groups[motions.groups >= 0], return_counts=True)
+    assert found.tolist() == [*range(-(-256 // rows))]
+    assert counts[0] == rows - _draws.WARM_UP
+
+
+def test_a_run_of_less_than_a_segment_is_to_be_longer() -> None:
+    # The shortest segment has 2.5 time constants of 2.4 s: 300 rows of 20 ms.
+    with pytest.raises(DataError, match="no two segments with outputs; record longer"):
+        _draws._Motions.of(neck_recording(256), Model(kind="rls", sample_time=0.02, arrays={}), 12.0)
