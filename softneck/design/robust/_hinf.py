@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -140,7 +141,9 @@ def _verify_norm(closed: Any, bound: float) -> float:
             f"the result is not stable (a pole at {largest:.3g} rad/s): the problem is near singular. Weigh the "
             "control effort more (W2), or build further `above` gamma."
         )
-    response = np.moveaxis(np.asarray(closed(1j * np.geomspace(1e-4, 1e5, 400), squeeze=False)), -1, 0)
+    A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (closed.A, closed.B, closed.C, closed.D))
+    s = 1j * np.geomspace(1e-4, 1e5, 400)[:, None, None]
+    response = C @ np.linalg.solve(s * np.eye(len(A)) - A, np.broadcast_to(B, (len(s), *B.shape))) + D
     size = float(np.linalg.norm(response, 2, axis=(1, 2)).max())
     if size > (1.0 + _NORM_TOLERANCE) * bound:
         raise SettingsError(f"the result has a norm of {size:.4g}, beyond {bound:.4g}: scale the weights.")
@@ -226,8 +229,8 @@ def least_gamma(plant: Partition) -> float:
     Raises:
         SettingsError: none up to 1e8.
     """
-    low, high = 0.0, 1.0
-    while solve_at(plant, high) is None:
+    solve, low, high = _riccati_pair(plant), 0.0, 1.0
+    while solve(high) is None:
         low, high = high, 4.0 * high
         if high > _MAX_GAMMA:
             raise SettingsError(
@@ -235,13 +238,49 @@ def least_gamma(plant: Partition) -> float:
             )
     while high - low > _GAMMA_TOLERANCE * high:
         middle = 0.5 * (low + high) if low > 0.0 else 0.25 * high
-        if solve_at(plant, middle) is None:
+        if solve(middle) is None:
             low = middle
         else:
             high = middle
         if high < 1e-8:
             break
     return high
+
+
+def _riccati_pair(plant: Partition) -> Callable[[float], tuple[Matrix, Matrix, Matrix, Matrix] | None]:
+    """Return a function: gamma -> X, Y and their R, or None where no controller keeps the loop below gamma.
+
+    What does not depend on gamma is computed here, once. Zhou, Doyle and Glover (1996), Theorem 17.1.
+    """
+    A, B1, C1, D11 = plant.A, plant.B1, plant.C1, plant.D11
+    m1, m2, p1, p2 = B1.shape[1], plant.B2.shape[1], C1.shape[0], plant.C2.shape[0]
+    least = max(_size(D11[: p1 - m2]), _size(D11[:, : m1 - p2]))
+    B, C = np.hstack([B1, plant.B2]), np.vstack([C1, plant.C2])
+    D_row, D_column = _direct(plant)
+    row, column, Q, P = D_row.T @ D_row, D_column @ D_column.T, C1.T @ C1, B1 @ B1.T
+    cross, other = C1.T @ D_row, B1 @ D_column.T
+
+    def solve(gamma: float) -> tuple[Matrix, Matrix, Matrix, Matrix] | None:
+        if gamma <= least:
+            return None
+        g2, R, S = gamma * gamma, row.copy(), column.copy()
+        R[:m1, :m1] -= g2 * np.eye(m1)
+        S[:p1, :p1] -= g2 * np.eye(p1)
+        X = _riccati(A, B, Q, R, cross)
+        Y = None if X is None else _riccati(A.T, C.T, P, S, other)
+        if X is None or Y is None or np.abs(np.linalg.eigvals(X @ Y)).max(initial=0.0) >= g2:
+            return None
+        return X, Y, R, S
+
+    return solve
+
+
+def _direct(plant: Partition) -> tuple[Matrix, Matrix]:
+    """Return [D11 D12] and [D11; D21]."""
+    m2, p2 = plant.B2.shape[1], plant.C2.shape[0]
+    a, b = plant.C1.shape[0] - m2, plant.B1.shape[1] - p2
+    D12, D21 = np.vstack([np.zeros((a, m2)), np.eye(m2)]), np.hstack([np.zeros((p2, b)), np.eye(p2)])
+    return np.hstack([plant.D11, D12]), np.vstack([plant.D11, D21])
 
 
 def solve_at(plant: Partition, gamma: float) -> tuple[Matrix, Matrix, Matrix, Matrix] | None:
@@ -251,23 +290,17 @@ def solve_at(plant: Partition, gamma: float) -> tuple[Matrix, Matrix, Matrix, Ma
     """
     from scipy.linalg import cholesky
 
+    solved = _riccati_pair(plant)(gamma)
+    if solved is None:
+        return None
+    X, Y, R, S = solved
     A, B1, B2, C1, C2, D11 = plant.A, plant.B1, plant.B2, plant.C1, plant.C2, plant.D11
     n, m1, m2, p1, p2 = A.shape[0], B1.shape[1], B2.shape[1], C1.shape[0], C2.shape[0]
     a, b = p1 - m2, m1 - p2
     D1111, D1112, D1121, D1122 = D11[:a, :b], D11[:a, b:], D11[a:, :b], D11[a:, b:]
-    if gamma <= max(_size(D11[:a]), _size(D11[:, :b])):
-        return None
     g2 = gamma * gamma
     B, C = np.hstack([B1, B2]), np.vstack([C1, C2])
-    D_row = np.hstack([D11, np.vstack([np.zeros((a, m2)), np.eye(m2)])])
-    D_column = np.vstack([D11, np.hstack([np.zeros((p2, b)), np.eye(p2)])])
-    R, S = D_row.T @ D_row, D_column @ D_column.T
-    R[:m1, :m1] -= g2 * np.eye(m1)
-    S[:p1, :p1] -= g2 * np.eye(p1)
-    X = _riccati(A, B, C1.T @ C1, R, C1.T @ D_row)
-    Y = None if X is None else _riccati(A.T, C.T, B1 @ B1.T, S, B1 @ D_column.T)
-    if X is None or Y is None or np.abs(np.linalg.eigvals(X @ Y)).max(initial=0.0) >= g2:
-        return None
+    D_row, D_column = _direct(plant)
     F = -np.linalg.solve(R, D_row.T @ C1 + B.T @ X)
     L = -np.linalg.solve(S, D_column @ B1.T + C @ Y).T
     F12, F2 = F[b:m1], F[m1:]
