@@ -338,7 +338,8 @@ def test_missing_samples_are_allowed_where_a_sensor_may_miss_one() -> None:
 @pytest.mark.parametrize("bad", [0.5, np.nan, np.inf, 2.0**53, -(2.0**53)])
 def test_runs_are_numbered_by_integers_that_a_float_holds(bad: float) -> None:
     for column in (np.array([1.0, bad]), pd.Series([1.0, bad])):
-        with pytest.raises(DataError, match="column `run`"):
+        told = "holds an empty cell at row 1" if np.isnan(bad) else "must hold integers"
+        with pytest.raises(DataError, match=f"column `run` {told}"):
             _files.integers(column)
     assert _files.integers(np.array([2.0**53 - 1, -3.0])).tolist() == [2**53 - 1, -3]
 
