@@ -19,7 +19,15 @@ from softneck.core._certificate import required_rows
 from softneck.estimation import LinearNeck
 from softneck.loop import LoopResult, metrics
 from softneck.robot import Robot
-from softneck.verification import Scale, _plants, make_requirements, metric_names, metric_title, read_requirements
+from softneck.verification import (
+    Scale,
+    _plants,
+    _steps,
+    make_requirements,
+    metric_names,
+    metric_title,
+    read_requirements,
+)
 from softneck.verification._linear import LinearLaw, frequency_grid
 from softneck.verification._plants import (
     all_plants,
@@ -31,7 +39,7 @@ from softneck.verification._plants import (
     within_weight,
 )
 from softneck.verification._requirements import Requirement, apply_safety_margin, expand_metrics, select_for_verify
-from softneck.verification._steps import StepTest, _metrics, check_ports, run_steps
+from softneck.verification._steps import StepTest, _metrics, check_ports, middle_motors, middle_of, run_steps
 from softneck.verification._verify import sources_of, to_json
 
 from .necks import TS, controller_of, family, linear_neck, pi
@@ -546,3 +554,63 @@ def test_a_file_of_requirements_is_a_path_and_its_errors_name_it(tmp_path: Path)
         expand_metrics({"require": 3, "overshoot_pct": 5.0}, Robot.preset(), stepping=True)
     with pytest.raises(SettingsError, match=r"unknown requirement `overshot_pct`; .*overshoot_pct"):
         expand_metrics({"overshot_pct": 5.0}, Robot.preset(), stepping=True)
+
+
+def test_steps_are_made_around_the_rest_of_a_robot_or_the_middle_of_its_ranges() -> None:
+    def robot(**more: Any) -> Robot:
+        tables = {
+            "name": "cart", "directions": {"kind": "matrix", "matrix": [[1.0, 0.5], [0.0, 1.0]]},
+            "motors": {"names": ["a", "b"], "unit": "kPa", **more.get("motors", {})},
+            "outputs": {"names": ["x", "y"], "unit": "mm", **more.get("outputs", {})},
+        }  # fmt: skip
+        return Robot.from_dict(tables)
+
+    block: Any = SimpleNamespace(parameters=())
+    assert middle_of(robot()).tolist() == [0.0, 0.0]
+    ends = {"min": [-10.0, 4.0], "max": [30.0, 8.0]}
+    assert middle_of(robot(outputs=ends)) == pytest.approx([0.01, 0.006])
+    assert middle_of(robot(outputs=ends | {"rest": [1.0, 5.0]})) == pytest.approx([0.001, 0.005])
+    assert middle_motors(robot(), block).tolist() == [0.0, 0.0]
+    ends = {"setpoint_min": [0.0, 10.0], "setpoint_max": [80.0, 40.0]}
+    assert middle_motors(robot(motors=ends), block) == pytest.approx([40e3, 25e3])
+    assert middle_motors(robot(motors=ends | {"rest": [3.0, 12.0]}), block) == pytest.approx([3e3, 12e3])
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3, 9])
+def test_each_plant_is_stepped_once_with_the_channels_of_its_controller(
+    workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A channel that a controller lacks has no place; one that looks ahead sees the step from the start."""
+    plants = all_plants([source_of_family(family(), "f")], 24, 0).take(range(7))
+    seen: list[Any] = []
+    monkeypatch.setattr(_steps, "load_functions", lambda _: SimpleNamespace(sweep_run=lambda *args: seen.append(args)))
+    inputs = [
+        "roll_reference",
+        "pitch_reference",
+        "pitch_reference_ahead",
+        "pitch",
+        "roll",
+        "enabled",
+        "motor_position_2",
+    ]
+    outputs = ["motor_setpoint_3", "motor_setpoint_1", "motor_setpoint_2"]
+    block: Any = SimpleNamespace(
+        runtime="r", arrays=(), initial_state=lambda: SimpleNamespace(parameters=np.zeros(1)),
+        inputs=[SimpleNamespace(name=name, start=0.5 + k) for k, name in enumerate(inputs)],
+        outputs=[SimpleNamespace(name=name) for name in outputs],
+    )  # fmt: skip
+    signals = np.arange(28.0).reshape(4, 7) + 100.0
+    y, P = _steps._run(plants, block, signals, np.eye(3), Robot.preset(), workers)
+    assert (y.shape, P.shape) == ((7, 4, 2), (7, 4, 3))
+    first, *rest = seen
+    assert first[5].shape[0] == 1
+    # Threads take them in any order.
+    stepped = sorted(str(row) for args in rest for row in args[5].tolist())
+    assert stepped == sorted(map(str, plants.numerator.tolist()))
+    assert sum(len(args[-1]) for args in rest) == sum(len(args[8]) for args in rest) == 7
+    assert len(rest) == min(workers, 7)
+    start, places, outputs_at = first[2], first[3], first[4]
+    assert start.tolist() == [0.5, 1.5, 100.0, 3.5, 4.5, 5.5, 6.5]
+    # References, co-contraction, outputs, positions, healthy, enabled.
+    assert places.tolist() == [1, 0, -1, 3, 4, -1, 6, -1, -1, 5]
+    assert outputs_at.tolist() == [1, 2, 0, 3]
