@@ -142,3 +142,25 @@ def test_the_tab_key_goes_down_the_page(view: Shown) -> None:
     stops = [(round(top), left) for _, top, left in places]
     assert sum(tag == "A" for tag, _, _ in places) == 2
     assert stops == sorted(stops)
+
+
+# Words of cells that stand on two lines.
+_BROKEN = """() => [...document.querySelectorAll("td")].flatMap(cell => {
+  const text = cell.firstChild, range = document.createRange();
+  return [...text.data.matchAll(/\\S+/g)].filter(word => {
+    range.setStart(text, word.index);
+    range.setEnd(text, word.index + word[0].length);
+    return range.getClientRects().length > 1;
+  }).map(word => word[0]);
+})"""
+
+
+def test_a_table_of_long_names_scrolls_on_a_phone_and_breaks_no_word(browser: Browser, tmp_path: Path) -> None:
+    names = ["motor_setpoint_1", "commanded_position_of_winch_1 [rad]", "-2.953 to 3.126 rad", "inverted"]
+    table = Table("Channels", ["channel", "from", "in the recording", "changed"], [names], text=2)
+    file = tmp_path / "page.html"
+    file.write_text(page("Import", [Section("Mapping", tables=[table])]), encoding="utf-8")
+    with shown(browser, file, width=400) as view:
+        assert view.page.evaluate(_BROKEN) == []
+        assert view.page.evaluate("document.documentElement.scrollWidth") <= 400
+        assert view.page.evaluate("[...document.querySelectorAll('.scroll')].some(n => n.scrollWidth > n.clientWidth)")
