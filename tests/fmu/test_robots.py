@@ -166,6 +166,9 @@ def test_pressures_and_lengths_keep_their_names_units_and_ranges(
     (bar,), (mm,) = units["Pa"].displayUnits, units["m"].displayUnits
     assert (bar.name, bar.factor, mm.name, mm.factor) == ("bar", 1e-5, "mm", 1e3)
     assert (pressure.displayUnit, found["x"].displayUnit) == ("bar", "mm")
+    tunable = {name: found[name].unit for name in found if found[name].variability == "tunable"}
+    gains = dict.fromkeys(("x_gain", "y_gain", "z_gain"), "m/Pa")
+    assert tunable == ({**gains, "dead_time": None} if kind == "oe" else {})
     inputs = {name: rec.channels[name][:60] for name in rec.robot.set_points}
     # To rounding: sums in another order, 1e5 Pa of what makes 1e-2 m.
     np.testing.assert_allclose(

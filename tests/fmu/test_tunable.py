@@ -310,7 +310,7 @@ def test_another_master_changes_a_gain(importer: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(np.load(out), expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["rls", "oe"])
+@pytest.mark.parametrize("kind", ["rls", "oe", "miso", "oe2"])
 def test_a_plant_with_its_start_values_changes_no_bit(kind: str) -> None:
     block, u = block_of(kind), inputs_of(block_of(kind), 200)
     whole, identified = exported_block(block), plain_run(block, u, use_measurement=1.0)
@@ -321,8 +321,41 @@ def test_a_plant_with_its_start_values_changes_no_bit(kind: str) -> None:
         assert not np.array_equal(plain_run(whole, u, use_measurement=1.0, **{port.name: other}), identified), port.name
 
 
+@pytest.mark.parametrize("build", [build_fmu, pytest.param(build_compiled_fmu, marks=needs_c)])
+def test_gain_and_dead_time_of_a_state_space_change_while_running(build: Any, tmp_path: Path, running: Any) -> None:
+    block, path = exported_block(block_of("miso")), tmp_path / "Plant.fmu"
+    build(block_of("miso"), path)
+    start = {port.name: port.start for port in block.parameters}
+    u = np.random.default_rng(5).uniform(-1.0, 1.0, (160, 3))
+    u[:40], u[80:] = [1.0, -1.0, 0.5], u[79]  # held, so that the slowest pole leaves 1e-3 of what was before
+
+    def run(changes: dict[int, dict[str, float]]) -> Matrix:
+        seen = []
+        with running(path) as fmu:
+            fmu.begin(**changes.get(0, {}))
+            for k, row in enumerate(u):
+                fmu.set(**(changes.get(k, {}) if k else {}), **dict(zip(MOTORS, row, strict=True)))
+                fmu.fmu.doStep(k * TS, TS)
+                seen.append(fmu.get("pitch", "roll"))
+        return np.array(seen)
+
+    as_it_is, doubled = run({}), {"pitch_gain": 2.0 * start["pitch_gain"]}
+    # From rest: the answer is scaled, alone that of the output; or as many samples later. To rounding.
+    np.testing.assert_allclose(run({0: doubled}), as_it_is * [2.0, 1.0], rtol=0, atol=1e-14)
+    late = run({0: {"dead_time": start["dead_time"] + 3.0}})
+    np.testing.assert_allclose(late[3:], as_it_is[:-3], rtol=0, atol=1e-14)
+    # On the way: nothing jumps, and the answers to later set-points are the scaled ones, those to earlier ones fade.
+    changed = run({40: doubled})
+    np.testing.assert_array_equal(changed[:40], as_it_is[:40])
+    # A pole at 0.9 moves towards twice the value by a tenth of it in a sample.
+    assert 0.0 < abs(changed[40, 0] - as_it_is[40, 0]) < 0.15 * abs(as_it_is[39, 0])
+    np.testing.assert_allclose(changed[-1], as_it_is[-1] * [2.0, 1.0], rtol=1e-3)
+    with pytest.raises(ValueError, match="dead_time"):
+        Block.initial_state(block, dead_time=start["dead_time"] + 11.0)
+
+
 def test_plants_of_other_forms_have_none() -> None:
-    for kind in ("miso", "oe2"):
+    for kind in ("nn", "play"):
         assert not any(port.tunable for port in exported_block(block_of(kind)).parameters)
 
 

@@ -1,4 +1,4 @@
-"""Tunable parameters of FMUs: gains of PI and PID, and gain, time constant and dead time of first-order plants."""
+"""Tunable parameters of FMUs: gains of PI and PID; gain, time constant and dead time of linear plants."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 from softneck.core import Matrix
 from softneck.design.linear._linear_parts_runtime import LinearArrays
 from softneck.identification.linear._arx_runtime import ArxArrays
+from softneck.identification.linear._state_space_parts_runtime import StateSpaceArrays
+from softneck.identification.models._histories_runtime import NarxArrays
 from softneck.runtime import Block, Port
 
 _LINEAR_RUNTIME = "softneck.design.linear._linear_controller_runtime"
@@ -25,14 +27,19 @@ _PLANTS = {
     "softneck.identification.linear._rls_runtime": (np.zeros(1),),
     "softneck.identification.linear._oe_runtime": (),
 }
+_STATE_SPACE_RUNTIME = "softneck.identification.linear._state_space_runtime"
+_TUNABLE_STATE_SPACE_RUNTIME = "softneck.fmu.describe._tunable_state_space_runtime"
 _PLANT_RUNTIME = "softneck.fmu.describe._tunable_plant_runtime"
 # A dead time may be twice as long, and this many samples longer at least.
 _MORE_DEAD_TIME = 10
 
 
 def with_tunable_parameters(block: Block) -> Block:
-    """Add tunable parameters to a PI, a PID or a first-order plant; other blocks are returned unchanged."""
-    return with_tunable_plant(block) if block.role == "plant" else with_tunable_gains(block)
+    """Add tunable parameters to a PI, a PID or a linear plant; other blocks are returned unchanged."""
+    if block.role != "plant":
+        return with_tunable_gains(block)
+    in_state_space = block.runtime.partition("@")[0] == _STATE_SPACE_RUNTIME
+    return with_tunable_state_space(block) if in_state_space else with_tunable_plant(block)
 
 
 def with_tunable_plant(block: Block) -> Block:
@@ -52,10 +59,7 @@ def with_tunable_plant(block: Block) -> Block:
         return block
     identified = _rounded([gains, -block.sample_time / np.log(-a)])
     longest = np.maximum(2.0 * p.delay, p.delay + _MORE_DEAD_TIME)
-    arrays = list(block.arrays)
-    # Histories hold the set-points of the longest dead time.
-    arrays[ArxArrays.place("history")] = p.history.copy()
-    arrays[ArxArrays.place("history")][0] = max(p.history[0], longest.max() + p.b.shape[1])
+    arrays = _with_history(block.arrays, longest.max() + p.b.shape[1])
     ports = []
     for output, (gain, lag), delay, most in zip(block.outputs, identified, p.delay, longest, strict=False):
         ports += _plant_ports(block, output, (float(gain), float(lag), float(delay)), float(most))
@@ -65,6 +69,52 @@ def with_tunable_plant(block: Block) -> Block:
         arrays=(*arrays, *_PLANTS[module], identified, np.array([block.sample_time])),
         parameters=(*block.parameters, *ports),
     )
+
+
+def with_tunable_state_space(block: Block) -> Block:
+    """Add the gain of each output of a stable state space, and its dead time, to its parameters.
+
+    A gain is that from the set-point with the largest one; the others change in proportion.
+    """
+    p = StateSpaceArrays(block.arrays)
+    matrices = all(array.ndim == p.A.ndim == len(p.A.shape[:2]) for array in (p.B, p.K))  # others are refused later
+    if not matrices or np.abs(np.linalg.eigvals(p.A)).max() >= 1.0:
+        return block
+    outputs = p.K.shape[1]
+    static = np.linalg.solve(np.eye(len(p.A)) - p.A, p.B)[:outputs]
+    motors = np.abs(static).argmax(axis=1)
+    identified = _rounded([static[np.arange(outputs), motors]])[:, 0]
+    if not identified.all():
+        return block
+    delay = float(p.delay[0])
+    longest = max(2.0 * delay, delay + _MORE_DEAD_TIME)
+    ports = []
+    for output, gain, motor in zip(block.outputs, identified.tolist(), motors, strict=False):
+        low, high = _span(gain)
+        source = block.inputs[motor]
+        what = f"static gain of {output.name} from {source.name}, with those from others in proportion"
+        ports.append(
+            Port(name=f"{output.name}_gain", unit=_per(source.unit, output.unit), start=gain, minimum=low, maximum=high,
+                 tunable=True, description=what)
+        )  # fmt: skip
+    what = f"dead time of all outputs in samples of {block.sample_time:g} s, beside that of the motors"
+    ports.append(
+        Port(name="dead_time", start=delay, minimum=0.0, maximum=longest, integer=True, tunable=True, description=what)
+    )
+    return replace(
+        block,
+        runtime=_TUNABLE_STATE_SPACE_RUNTIME + block.runtime.removeprefix(_STATE_SPACE_RUNTIME),
+        arrays=(*_with_history(block.arrays, longest + 1.0), identified),
+        parameters=(*block.parameters, *ports),
+    )
+
+
+def _with_history(arrays: Sequence[Matrix], samples: float) -> list[Matrix]:
+    """Return the arrays of a plant with histories of at least so many samples, for the longest dead time."""
+    found, place = list(arrays), NarxArrays.place("history")
+    found[place] = found[place].copy()
+    found[place][0] = max(found[place][0], samples)
+    return found
 
 
 def _plant_ports(block: Block, output: Port, values: Sequence[float], most: float) -> list[Port]:

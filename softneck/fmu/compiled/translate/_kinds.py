@@ -31,6 +31,7 @@ _NECK_RUNTIMES = (
     "softneck.fmu.describe._modelled_drives_runtime",
     "softneck.fmu.describe._tunable_gains_runtime",
     "softneck.fmu.describe._tunable_plant_runtime",
+    "softneck.fmu.describe._tunable_state_space_runtime",
     "softneck.loop._reference_runtime",
 )
 # Runtimes for robots of any size, in addition to those above, whose sizes are the neck's and known at compile time.
@@ -50,6 +51,7 @@ _ROBOT_RUNTIMES = (
     "softneck.design.predictive._mpc_runtime",
     "softneck.fmu.describe._tunable_gains_runtime",
     "softneck.fmu.describe._tunable_plant_runtime",
+    "softneck.fmu.describe._tunable_state_space_runtime",
     "softneck.loop._reference_runtime",
 )
 RUNTIMES = (*_NECK_RUNTIMES, *(f"{module}@{ANY_SIZE}" for module in _ROBOT_RUNTIMES))
