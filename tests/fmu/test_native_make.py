@@ -11,7 +11,7 @@ from softneck.core import SettingsError
 from softneck.fmu.compiled import _compilers, _library
 from softneck.fmu.compiled._compilers import PLATFORMS, Platform
 from softneck.fmu.compiled._sources import GENERATED, Sources
-from softneck.fmu.compiled.translate._kinds import LIBRARIES
+from softneck.fmu.compiled.translate._kinds import LIBRARIES, RUNTIMES
 
 SOURCES = Sources({GENERATED: "/* none */"}, {})
 
@@ -77,3 +77,29 @@ def test_a_compiler_may_wait_but_not_work_for_ever(does: str, ends: bool, monkey
     else:
         with pytest.raises(SettingsError, match="each process may take 1 s of processor time"):
             _compilers.compile_here(SOURCES, command)
+
+
+def test_without_a_built_library_this_machine_compiles_the_part_that_an_fmu_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, ...]] = []
+
+    def c_sources(modules: tuple[str, ...], **_: bool) -> Sources:
+        asked.append(modules)
+        return SOURCES
+
+    monkeypatch.setattr(_library, "packaged_library", lambda *_: None)
+    monkeypatch.setattr(_library, "c_sources", c_sources)
+    monkeypatch.setattr(_library, "compile_here", lambda *_: repr(asked[-1]).encode())
+    monkeypatch.setattr(_library, "local_compiler", lambda: ["cc"])
+    monkeypatch.setattr(_library, "_cache_folder", lambda: tmp_path)
+    libraries = [_library.find_library({module}) for part in LIBRARIES.values() for module in sorted(part)]
+    # Each part once, and every kind in the part that was compiled for it.
+    assert len(asked) == len(LIBRARIES)
+    assert {frozenset(modules) for modules in asked} == set(LIBRARIES.values())
+    modules = [module for part in LIBRARIES.values() for module in sorted(part)]
+    for module, library in zip(modules, libraries, strict=True):
+        assert repr(module) in next(iter(library.binaries.values())).decode()
+    # No part has kinds of two: the whole.
+    _library.find_library({min(LIBRARIES["models"] - LIBRARIES["control"]), min(LIBRARIES["robot_control"])})
+    assert set(asked[-1]) == set(RUNTIMES)

@@ -46,7 +46,7 @@ class Library:
 
 
 def find_library(modules: set[str] | None = None, *, sensitivities: bool = False) -> Library:
-    """Return the available libraries; if there are none, compile one for this machine.
+    """Return the available libraries; if there are none, compile the part with these modules for this machine.
 
     `modules`: that it must contain; modules for robots of other sizes than the neck are compiled for this machine.
     `sensitivities`: with the derivatives of the kinds' steps. Raises FileFormatError: a library is damaged;
@@ -57,7 +57,8 @@ def find_library(modules: set[str] | None = None, *, sensitivities: bool = False
     if sensitivities:
         local = tuple(sorted(modules or RUNTIMES))
         return packaged_library(SENSITIVE, modules) or _local_library(local, sensitivities=True)
-    return packaged_library(BINARIES, modules) or _local_library()
+    part = _part(modules)
+    return packaged_library(BINARIES, modules) or _local_library(tuple(sorted(LIBRARIES[part])) if part else RUNTIMES)
 
 
 def packaged_library(folder: Path = BINARIES, modules: set[str] | None = None) -> Library | None:
