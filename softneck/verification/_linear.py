@@ -324,7 +324,7 @@ class AxisMargins:
 
 
 def axis_margins(
-    measured: AxisMeasured, law: LinearLaw, axis: int, *, source: str, name: str, extra: int, rolloff: float = -1.0
+    measured: AxisMeasured, law: LinearLaw, axis: int, *, source: str, name: str, extra: int, rolloff: float
 ) -> AxisMargins:
     """Return the margins of one axis; `rolloff` of the plant above the band in dB/decade, negative: unknown."""
     Ts = law.sample_time

@@ -880,3 +880,19 @@ class _Found:
     holds: bool = False
     loosened: Any = None
     controller: Any = None
+
+
+@pytest.mark.parametrize("loads", [[[0.0, 0.5], [0.2, 1.0]], [[1.0, 0.2], [0.5, 0.0]]])
+def test_default_payloads_end_where_the_draws_of_every_family_have_them(
+    loads: list[list[float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    families = [SimpleNamespace(draws=SimpleNamespace(conditions={"payload_kg": kg})) for kg in loads]
+    asked: list[Any] = []
+    monkeypatch.setattr(_tune, "sources_of", lambda _: {})
+    monkeypatch.setattr(_tune, "default_rise", lambda *_: 0.5)
+    monkeypatch.setattr(_tune, "make_tune_requirements", lambda *_, **settings: asked.append(settings["payload"]))
+    _tune._read_requirements({}, Robot.preset(), [*families, SimpleNamespace(draws=None)], stepping=True)
+    assert set(asked) == {0.5}
+    asked.clear()
+    _tune._read_requirements({}, Robot.preset(), [SimpleNamespace(draws=None)], stepping=True)
+    assert set(asked) == {None}

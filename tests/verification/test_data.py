@@ -63,7 +63,7 @@ def on_data(**values: float) -> Family:
 
 def test_margins_of_a_disk_are_those_of_its_worst_points() -> None:
     """Closed forms against a thousand points of each disk."""
-    item = axis_margins(measured(), LAW, 0, source="f", name="pitch", extra=0)
+    item = axis_margins(measured(), LAW, 0, source="f", name="pitch", extra=0, rolloff=-1.0)
     w = np.geomspace(0.3, 25.0, 400)
     L0 = -LAW.feedback(w)[:, 0, 0] * response_of(MODEL, w, TS)
     D = 0.3 * np.exp(1j * np.linspace(0.0, 2.0 * math.pi, 1000))[:, None]
@@ -89,26 +89,30 @@ def test_without_uncertainty_the_margins_are_those_of_the_plant() -> None:
 
     plant = nominal_plants([source_of_model(linear_neck(), "m", {"gain": 0.0, "pole": 0.0, "delay": 0.0})])[0]
     exact = margins(plant, LAW)
-    item = axis_margins(measured(weight=1e-9, high=100.0), LAW, 0, source="f", name="pitch", extra=0)
+    item = axis_margins(measured(weight=1e-9, high=100.0), LAW, 0, source="f", name="pitch", extra=0, rolloff=-1.0)
     for name in ("sensitivity", "disk_margin", "gain_margin", "phase_margin_deg", "delay_margin_ms"):
         # 400 frequencies over two decades and a half: 1.5 % apart, at crossings half of that.
         assert item.margins[name] == pytest.approx(exact[f"pitch.{name}"][0], rel=0.02), name
 
 
 def test_a_weight_that_may_hold_an_unstable_loop_leaves_no_margin() -> None:
-    item = axis_margins(measured(weight=1.5, high=100.0), LAW, 0, source="f", name="pitch", extra=0)
+    item = axis_margins(measured(weight=1.5, high=100.0), LAW, 0, source="f", name="pitch", extra=0, rolloff=-1.0)
     assert item.mu >= 1.0
     assert item.margins["gain_margin"] == 1.0
     assert item.margins["sensitivity"] == math.inf
 
 
 def test_a_gain_margin_ends_where_the_band_does() -> None:
-    wide = axis_margins(measured(weight=0.01, high=100.0), LAW, 0, source="f", name="pitch", extra=0)
-    narrow = axis_margins(measured(weight=0.01, high=1.3 * wide.crossover), LAW, 0, source="f", name="pitch", extra=0)
+    wide = axis_margins(measured(weight=0.01, high=100.0), LAW, 0, source="f", name="pitch", extra=0, rolloff=-1.0)
+    narrow = axis_margins(
+        measured(weight=0.01, high=1.3 * wide.crossover), LAW, 0, source="f", name="pitch", extra=0, rolloff=-1.0
+    )
     # The loop falls about as 1/w at its crossover: 1.3 times the gain moves it to the band's end.
     assert narrow.margins["gain_margin"] == pytest.approx(1.3, rel=0.1)
     assert wide.margins["gain_margin"] > 2.0
-    beyond = axis_margins(measured(weight=0.01, high=0.7 * wide.crossover), LAW, 0, source="f", name="pitch", extra=0)
+    beyond = axis_margins(
+        measured(weight=0.01, high=0.7 * wide.crossover), LAW, 0, source="f", name="pitch", extra=0, rolloff=-1.0
+    )
     assert beyond.margins == {}
     assert "not supported by the data: f excites pitch from 0.3 to" in beyond.why()
     assert "record `multisine --band" in beyond.why()
@@ -340,7 +344,7 @@ def test_a_tested_family_holds_no_plant_that_its_recordings_exclude_and_reaches_
 def test_mu_over_the_weight_of_axes_apart_is_the_largest_of_each(weight: float) -> None:
     neck = replace(source_of_family(on_data(weight=weight), "f"), cross=np.zeros(2))
     found = structured_singular_value(neck, LAW, extra=0)
-    alone = axis_margins(measured(weight=weight), LAW, 0, source="f", name="pitch", extra=0)
+    alone = axis_margins(measured(weight=weight), LAW, 0, source="f", name="pitch", extra=0, rolloff=-1.0)
     # 90 frequencies in two decades: 5 % apart, and the peak is flat; the other grid adds half its step.
     assert found[0].mu == pytest.approx(alone.mu, rel=0.03)
 
