@@ -97,6 +97,7 @@ def test_auto_saves_the_best_of_the_other_sort_beside_its_choice(
     assert not Path("best_linear.npz").exists()
 
 
+@pytest.mark.slow
 def test_auto_ends_with_exit_code_1_where_no_kind_makes_a_model(
     call: Call, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -147,6 +148,7 @@ def test_auto_prints_one_json_object_and_holds_out_the_last_of_several(call: Cal
     assert not chosen["stopped_early"]
 
 
+@pytest.mark.slow
 def test_auto_in_python_makes_the_same_model(call: Call, recording: Path) -> None:
     write_recording(Path("other.csv"), neck_recording(300, seed=44))
     facts = json.loads(call("identify", "auto", recording, "other.csv", "-o", "cli.npz", "--json").out)

@@ -287,6 +287,7 @@ def test_the_installed_command_says_the_same() -> None:
     assert done.stderr == "softneck: none.csv: no such file.\n"
 
 
+@pytest.mark.slow
 def test_the_real_neck_from_log_to_free_run(call: Call, shared_data: Path) -> None:
     log = shared_data / "neck_openloop/spring_test_0gr.csv"
     facts = one_object(call("import", log, "--layout", LAYOUTS / "neck_openloop.toml", "-o", "n.csv", "--json"))

@@ -66,6 +66,7 @@ def test_observer_controller_fmu_and_fits_are_the_same(call: Call, recording: Pa
     assert judged["fits"]["model"] == softneck.validate(rls_file, recording).fits
 
 
+@pytest.mark.slow
 def test_family_is_the_same(call: Call) -> None:
     write_recording("long.csv", neck_recording(2400))
     assert call("family", "long.csv", "-o", "cli.npz", "--draws", "0").code == 0

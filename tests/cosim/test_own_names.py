@@ -104,6 +104,7 @@ def test_fmus_have_them_too(parts: tuple[Any, Any], tmp_path: Path) -> None:
     np.testing.assert_array_equal(found, other)
 
 
+@pytest.mark.slow
 def test_linear_systems_take_both(parts: tuple[Any, Any]) -> None:
     model, _ = parts
     one, other = (model.linearize(at={name: 5e4}) for name in ("pressure_setpoint", "motor_setpoint_1"))

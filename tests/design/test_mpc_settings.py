@@ -61,6 +61,7 @@ def test_what_the_observer_is_ahead_is_dead_time_that_nobody_sees(look_ahead: fl
         np.testing.assert_allclose(mine, its, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
+@pytest.mark.slow
 def test_the_tuning_keeps_what_it_was_asked() -> None:
     asked = MpcSettings(max_sensitivity=1.4).design(bake_off_neck())
     assert max(asked.design["sensitivity"]) <= 1.4

@@ -199,6 +199,7 @@ def test_the_same_block_gives_the_same_bytes(kind: str, path: Path, tmp_path: Pa
     assert {"modelDescription.xml", "resources/model.bin", "sources/softneck.c", "sources/README.txt"} <= names
 
 
+@pytest.mark.slow
 def test_instances_in_threads_do_not_disturb_each_other(tmp_path: Path, running: Any) -> None:
     build_compiled_fmu(block_of("residual"), tmp_path / "Residual.fmu")
     block, u = block_of("residual"), inputs_of(block_of("residual"), 200)

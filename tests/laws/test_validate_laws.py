@@ -54,6 +54,7 @@ def test_scores_are_the_same_in_every_view(name: str) -> None:
         assert (found.diverged, found.white, found.uncorrelated) == (first.diverged, first.white, first.uncorrelated)
 
 
+@pytest.mark.slow
 def test_a_page_is_in_the_words_and_units_of_its_robot() -> None:
     for view in (View(), *UNITS["arm"]):
         seen, found = judged("arm", view)

@@ -89,6 +89,7 @@ def test_a_target_that_is_not_finite_is_refused() -> None:
         trained(NET, Z, np.full(6, np.inf), iterations=2, decay=1.0)
 
 
+@pytest.mark.slow
 def test_a_seed_gives_the_same_bits() -> None:
     first, again, other = (Network(hidden=(3, 3), iterations=3, seed=s).fit(short_neck()) for s in (1, 1, 2))
     for name in first.arrays:

@@ -297,6 +297,7 @@ def test_motors_that_were_not_always_logged_are_filled_and_not_zero() -> None:
     assert found.findings["missing"].startswith("12 rows")
 
 
+@pytest.mark.slow
 def test_a_response_of_files_is_drawn_and_described(tmp_path: Path) -> None:
     neck = VirtualNeck(NeckParameters.paper())
     parts = [

@@ -80,6 +80,7 @@ def test_equal_members_within_what_was_seen_are_the_model_to_the_bit() -> None:
     assert (outputs[:, :2] == free_run(member, U)[0][:, :2]).all()
 
 
+@pytest.mark.slow
 def test_any_robot_has_it() -> None:
     robot = Robot.preset("antagonist")
     names, outputs = robot.set_points, robot.outputs.names
