@@ -133,7 +133,9 @@ def test_the_plant_s_tendons_stand_where_the_robot_has_its_directions(names: tup
     one = robot(3, len(names), turn=10.0, outputs={**Robot.preset().as_dict()["outputs"], "names": names})
     angles = np.array(tendons_of(one, quiet()))
     # The plant bends its first output by cosines and its second by sines, which weights round at 1e-15.
-    np.testing.assert_allclose(np.array([np.cos(angles), np.sin(angles)])[: len(names)], one.weights(), atol=1e-14)
+    weights = one.weights()
+    assert weights is not None
+    np.testing.assert_allclose(np.array([np.cos(angles), np.sin(angles)])[: len(names)], weights, atol=1e-14)
 
 
 @pytest.mark.parametrize(("motors", "outputs"), SIZES)
