@@ -168,7 +168,8 @@ def faster_values(found: Tuned) -> dict[str, Any] | None:
     other, costs = min(fast, key=far), {}
     for bound in shown.bounds:
         a, b = (items[k].metrics.get(bound.metric) for k in (best, other))
-        if a is not None and b is not None and (b < 0.95 * a if bound.bound == "min" else b > 1.05 * a):
+        # What is not a number is worse.
+        if a is not None and b is not None and not (b >= 0.95 * a if bound.bound == "min" else b <= 1.05 * a):
             costs[bound.metric] = {"best": _number(a), "faster": _number(b), "unit": _unit(bound.metric, task.robot)}
     return {**said, "candidate": shown.order.index(other) + 1, "kind": items[other].kind,
             "value": items[other].metrics[shown.x], "costs": costs, "breaks": broken(other)}  # fmt: skip

@@ -158,7 +158,7 @@ class Draws(ReprMixin):
             if not whole or values.dtype != np.float64 or not np.isfinite(values).all():
                 raise FileFormatError(f"the draws of its array `{name}` do not fit its model.")
         share, noise, one_each = arrays["share"], arrays["noise"], (len(model.robot.outputs.names),)
-        if not all(own.shape == one_each and (own >= 0.0).all() for own in (share, noise)):
+        if not all(own.shape == one_each and (np.isfinite(own) & (own >= 0.0)).all() for own in (share, noise)):
             raise FileFormatError("its draws must have one share of the disturbance and one noise for each output.")
         if not 0.0 <= float(header["keep"]) < 1.0:
             raise FileFormatError("the disturbance of its draws must have a colour below 1.")

@@ -91,7 +91,7 @@ def recordings_start(found: Draws) -> np.ndarray:
     return np.ones((50, len(found.model.robot.motors.names)))
 
 
-@pytest.mark.parametrize("spoil", ["shape", "nan", "few", "share", "noise"])
+@pytest.mark.parametrize("spoil", ["shape", "nan", "few", "share", "noise", "share inf", "noise nan"])
 def test_draws_that_do_not_fit_their_model_are_refused(made: Callable[..., Draws], spoil: str) -> None:
     found = made()
     header, arrays = found.to_archive()
@@ -102,7 +102,8 @@ def test_draws_that_do_not_fit_their_model_are_refused(made: Callable[..., Draws
     elif spoil == "few":
         arrays["drawn_weights"] = arrays["drawn_weights"][:4]
     else:
-        arrays[spoil] = -arrays[spoil]
+        name, _, value = spoil.partition(" ")
+        arrays[name] = arrays[name] * float(value) if value else -arrays[name]
     with pytest.raises(FileFormatError, match="draws"):
         Draws.from_archive(header, arrays)
 
