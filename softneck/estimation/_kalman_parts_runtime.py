@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from softneck.runtime._compiled_runtime import COMPILED
 from softneck.runtime._layout import Arrays, StateVector, array, cells, value
+from softneck.runtime._products_runtime import add_product, product
 
 # Places in `constants`.
 KALMAN_LAG = 0  # and 1: samples that inputs of the first two axes need to act; parts of a sample are interpolated
@@ -221,40 +221,13 @@ def kalman_tell(p: KalmanArrays, x: KalmanState, noise: float, outputs: np.ndarr
         for axis in range(m):
             u[axis] = kalman_lagged(x.lines[axis], newest, kalman_lag(c, axis) - 1.0 - i)
         if i == whole:
-            before[:] = kalman_dot(H, now)
-        now = kalman_ahead(F, now, B, u)
-    y = kalman_dot(H, now)
+            before[:] = product(H, now)
+        now = product(F, now)
+        add_product(B, u, now)
+    y = product(H, now)
     for axis in range(m):
         # Linear interpolation between samples; the rate is its slope.
         outputs[axis] = before[axis] + part * (y[axis] - before[axis])
         # The model's rate over that sample, not a difference of noisy estimates.
         outputs[m + axis] = (y[axis] - before[axis]) / c[KALMAN_PERIOD]
     outputs[2 * m + 1] = 1.0 if kalman_healthy(c, x, noise) else 0.0
-
-
-def kalman_dot(A: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return A x; compiled loops beat BLAS on matrices this small."""
-    if not COMPILED:
-        return np.dot(A, x)
-    y = np.empty(A.shape[0])
-    for i in range(A.shape[0]):
-        total = 0.0
-        for j in range(A.shape[1]):
-            total += A[i, j] * x[j]
-        y[i] = total
-    return y
-
-
-def kalman_ahead(F: np.ndarray, x: np.ndarray, B: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return F x + B u."""
-    if not COMPILED:
-        return np.dot(F, x) + np.dot(B, u)
-    y = np.empty(F.shape[0])
-    for i in range(F.shape[0]):
-        total = 0.0
-        for j in range(B.shape[1]):
-            total += B[i, j] * u[j]
-        for j in range(F.shape[1]):
-            total += F[i, j] * x[j]
-        y[i] = total
-    return y

@@ -12,10 +12,8 @@ from softneck.estimation._kalman_parts_runtime import (
     KALMAN_GATE,
     KalmanArrays,
     KalmanState,
-    kalman_ahead,
     kalman_clear,
     kalman_count,
-    kalman_dot,
     kalman_first,
     kalman_forced,
     kalman_push,
@@ -24,6 +22,7 @@ from softneck.estimation._kalman_parts_runtime import (
 )
 from softneck.runtime._compiled_runtime import COMPILED
 from softneck.runtime._layout import cells
+from softneck.runtime._products_runtime import add_product, product
 from softneck.runtime._rest_runtime import REST
 
 
@@ -80,7 +79,9 @@ def kalman_predict(p: KalmanArrays, parameters: np.ndarray, x: np.ndarray, P: np
     """Replace `x` by F x + B u and `P` by F P F' + Q."""
     q1, q2 = parameters[1] * parameters[1], parameters[2] * parameters[2]
     QM, QW = p.first_noise, p.second_noise  # numba counts references where a loop takes them from `p`
-    x[:] = (kalman_ahead(p.F, x, p.B, u) + REST) - REST
+    ahead = product(p.F, x)
+    add_product(p.B, u, ahead)
+    x[:] = (ahead + REST) - REST
     if not COMPILED:
         np.dot(np.dot(p.F, P), p.F.T, P)
         P += q1 * QM
@@ -96,7 +97,7 @@ def kalman_correct(
     p: KalmanArrays, noise: float, x: KalmanFullState, P: np.ndarray, measured: np.ndarray, forced: bool
 ) -> tuple[float, bool]:
     """Correct x and P unless the gate rejects the measurement; return e' S^-1 e and whether it was accepted."""
-    e = measured - kalman_dot(p.H, x.x)
+    e = measured - product(p.H, x.x)
     r = float(noise * noise)
     PH = kalman_columns(P, p.H)
     S = kalman_columns(p.H, PH.T)
@@ -110,7 +111,7 @@ def kalman_correct(
         return innovation, False
     K = kalman_columns(PH, S)  # P H' S^-1, which is its own transpose
     estimate = x.x  # numba would copy the slice for `x.x[:] +=`
-    estimate += kalman_dot(K, e)
+    estimate += product(K, e)
     kalman_joseph(P, K, p.H, r)
     return innovation, True
 

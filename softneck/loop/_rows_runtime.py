@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from softneck.loop._faults_runtime import faults_act
+from softneck.runtime._compiled_runtime import COMPILED
 
 ROWS_DONE = 0
 ROWS_MISSING_INPUT = 1
@@ -52,30 +53,44 @@ def run_rows(
                 if problem != ROWS_DONE:
                     return problem, part
             elif what == ROWS_SHOW:
-                shown[part][:] = held[part]
+                rows_copy(held[part], shown[part])
             elif what == ROWS_REFER:
-                shown[part][:] = reference[k]
+                rows_copy(reference[k], shown[part])
             elif what == ROWS_DISTURB:
                 faults_act(k, part, faults, bus)
             else:
-                table[k] = bus
+                rows_copy(bus, table[k])
         # A stopped or saved run continues here.
         following[0] = k + 1
     return ROWS_DONE, 0
+
+
+def rows_copy(source: np.ndarray, target: np.ndarray) -> None:
+    """Copy a vector; compiled, a slice would first look for an overlap."""
+    if COMPILED:
+        for i in range(target.size):
+            target[i] = source[i]
+    else:
+        target[:] = source
 
 
 def rows_step(part: int, time: float, taps: tuple, bus: np.ndarray, outputs: np.ndarray, parts: tuple) -> int:
     """Gather the inputs of a part, step it, and check its outputs.
 
     taps: of each part, the positions of its inputs on the bus, their factors and offsets (none without conversion),
-    the inputs that must not be missing, and the outputs that may be (none without a check).
+    the inputs that must not be missing, the outputs that may be (none without a check), and memory for the inputs.
     """
-    slots, scales, fragile, missing = taps
+    slots, scales, fragile, missing, given = taps
     # A copy, so that no part can change the bus through its inputs.
-    inputs = bus[slots[part]]
-    if scales[part].size:
-        inputs *= scales[part][0]
-        inputs += scales[part][1]
+    places, scale, inputs = slots[part], scales[part], given[part]
+    if COMPILED:
+        for i in range(places.size):
+            inputs[i] = bus[places[i]]
+    else:
+        inputs = bus[places]  # a new one, as a part in Python may keep it
+    if scale.size:
+        for i in range(places.size):
+            inputs[i] = inputs[i] * scale[0, i] + scale[1, i]
     if fragile[part].size:
         # Parts that cannot use a missing value stop the run; all others get the NaN.
         for i in fragile[part]:

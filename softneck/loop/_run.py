@@ -160,6 +160,7 @@ class LoopRows:
                 tuple(np.zeros((2, 0)) if tap.scales is None else tap.scales for tap in taps),
                 tuple(tap.fragile for tap in taps),
                 tuple(np.array(flags, dtype=np.bool_) for flags in missing),
+                tuple(np.empty(tap.slots.size) for tap in taps),
             ),
             table,
         )

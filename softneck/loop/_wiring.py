@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -110,13 +111,48 @@ def wire(
     that is controlled. `closed`: whether it is a loop with a plant and a reference. Raises SettingsError: an input
     without a source, two writers, units that do not fit, an unknown name.
     """
+    wired = _Wired(tuple((name, tuple(part.inputs), tuple(part.outputs)) for name, part in parts.items()),
+                   tuple((name, tuple(values.items())) for name, values in constants.items()),
+                   tuple((connections or {}).items()), robot, closed)  # fmt: skip
+    return _wire(wired)
+
+
+@dataclass(frozen=True, slots=True)
+class _Ports:
+    """The ports of a part."""
+
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Wired:
+    """What a wiring depends on.
+
+    `ports`: name, inputs and outputs of each part. `constants`: part, and name and value of each. `connections`: target
+    and origin.
+    """
+
+    ports: tuple[tuple[str, tuple[Port, ...], tuple[Port, ...]], ...]
+    constants: tuple[tuple[str, tuple[tuple[str, float], ...]], ...]
+    connections: tuple[tuple[str, str | Link], ...]
+    robot: Robot
+    closed: bool
+
+
+@lru_cache(maxsize=64)
+def _wire(asked: _Wired) -> Wiring:
+    """Connect parts; of a search and its certificate thousands of loops have the same few wirings."""
+    parts = {name: _Ports(inputs, outputs) for name, inputs, outputs in asked.ports}
+    constants = {name: dict(values) for name, values in asked.constants}
+    connections, robot, closed = dict(asked.connections), asked.robot, asked.closed
     if closed:
         _check_plant(parts["plant"], constants.get("plant", {}), robot)
     ports = [(name, port) for name, part in parts.items() for port in part.outputs]
     if closed and "reference" not in parts:
         ports += [("reference", port) for port in reference_ports(robot)]
     slots = {(name, port.name): i for i, (name, port) in enumerate(ports)}
-    links = _links(connections or {}, parts, slots, constants)
+    links = _links(connections, parts, slots, constants)
     extra: list[float] = []
 
     taps = {}
@@ -133,7 +169,7 @@ def wire(
             else:
                 extra.append(value)
                 places.append(len(ports) + len(extra) - 1)
-        taps[name] = _tap(name, part, places, ports, connections or {})
+        taps[name] = _tap(name, part, places, ports, connections)
     start = np.array([port.start for _, port in ports] + extra)
     named = tuple(BusSignal(i, part, port) for i, (part, port) in enumerate(ports))
     spans, first = {}, 0
@@ -146,7 +182,7 @@ def wire(
 
 def _links(
     connections: Mapping[str, str | Link],
-    parts: Mapping[str, Part],
+    parts: Mapping[str, _Ports],
     slots: Mapping[tuple[str, str], int],
     constants: Mapping[str, Mapping[str, float]],
 ) -> dict[tuple[str, str], tuple[str, str]]:
@@ -173,13 +209,13 @@ def _ends(text: str) -> tuple[str, str]:
     return part, name
 
 
-def _offers(part: str, parts: Mapping[str, Part], what: str) -> str:
+def _offers(part: str, parts: Mapping[str, _Ports], what: str) -> str:
     if part not in parts:
         return f"the parts are {', '.join(parts)}."
     return f"the {part} has {', '.join(port.name for port in getattr(parts[part], what)) or 'none'}."
 
 
-def _check_plant(plant: Part, constants: Mapping[str, float], robot: Robot) -> None:
+def _check_plant(plant: _Ports, constants: Mapping[str, float], robot: Robot) -> None:
     names = [port.name for port in plant.inputs]
     for name in robot.set_points:
         if name not in names:
@@ -194,7 +230,7 @@ class _SourceFinder:
     """Finds the sources of the inputs of part `name`."""
 
     name: str
-    parts: Mapping[str, Part]
+    parts: Mapping[str, _Ports]
     slots: Mapping[tuple[str, str], int]
     constants: Mapping[str, float]
     links: Mapping[tuple[str, str], tuple[str, str]]
@@ -228,7 +264,7 @@ class _SourceFinder:
         raise SettingsError(f"nothing feeds input `{port.name}` of the {self.name}; it needs {tried}.")
 
 
-def _candidates(name: str, wanted: str, parts: Mapping[str, Part], robot: Robot) -> Iterator[tuple[str, str]]:
+def _candidates(name: str, wanted: str, parts: Mapping[str, _Ports], robot: Robot) -> Iterator[tuple[str, str]]:
     if sources := _sources(wanted, robot):
         yield from sources
     elif wanted in robot.set_points:
@@ -241,7 +277,7 @@ def _candidates(name: str, wanted: str, parts: Mapping[str, Part], robot: Robot)
 
 
 def _tap(
-    name: str, part: Part, places: list[int], ports: list[tuple[str, Port]], connections: Mapping[str, str | Link]
+    name: str, part: _Ports, places: list[int], ports: list[tuple[str, Port]], connections: Mapping[str, str | Link]
 ) -> Tap:
     scales, owners, sources, fragile = [], [], [], []
     for i, (port, place) in enumerate(zip(part.inputs, places, strict=True)):

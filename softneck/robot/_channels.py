@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -106,7 +107,8 @@ class Outputs:
         return "" if self.display_unit == "deg" else self.display_unit
 
 
-def motor_channels(motors: Sequence[str], outputs: Sequence[str], what: str) -> tuple[str, ...]:
+@cache
+def motor_channels(motors: tuple[str, ...], outputs: tuple[str, ...], what: str) -> tuple[str, ...]:
     """Return the channel of each motor for a quantity, such as "setpoint", "position" or "position_measured".
 
     `pressure` has `pressure_setpoint`; `motor_1`, or one whose channel would be another's, has `motor_setpoint_1`.

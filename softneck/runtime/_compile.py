@@ -6,7 +6,7 @@ import importlib.util
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -95,7 +95,7 @@ def _functions(module: str, compiled: bool) -> Any:
         return namespace
     # Which of them Python calls is not known: each once for Python, calling the inner ones, compiled when it is called.
     return SimpleNamespace(
-        **vars(namespace) | {name: _compiled(value, inner=False) for name, value in functions.items()}
+        **vars(namespace) | {name: _compiled(value, {}, inner=False) for name, value in functions.items()}
     )
 
 
@@ -131,7 +131,8 @@ def _link_parts(module: str, called: str, runtimes: tuple[str, ...]) -> Callable
     lines.append("    return False")  # no part has this index
     text = bundle(module, loops=False, skip=("part_step",)) + "\n".join(lines) + "\n"
     namespace = _import_text(text, compiled=True)
-    _compile(namespace, (called,))
+    # Counting references to the arrays of all parts, at each call of each step, took as long as a light step itself.
+    _compile(namespace, (called,), {"_nrt": False})
     return getattr(namespace, called)
 
 
@@ -149,8 +150,11 @@ def have_numba() -> bool:
     return importlib.util.find_spec("numba") is not None
 
 
-def _compile(namespace: ModuleType, called: Sequence[str]) -> bool:
-    """Compile the functions of a bundle, of which Python calls `called`; return whether numba is installed."""
+def _compile(namespace: ModuleType, called: Sequence[str], more: Mapping[str, Any] | None = None) -> bool:
+    """Compile the functions of a bundle, of which Python calls `called`; return whether numba is installed.
+
+    `more`: numba's options beside the usual ones.
+    """
     if not have_numba():
         return False
     _shorten_shape_errors()
@@ -158,16 +162,16 @@ def _compile(namespace: ModuleType, called: Sequence[str]) -> bool:
         vars(namespace)["COMPILED"] = 1  # see `_compiled_runtime`; numba takes it as a constant
     for name, value in list(vars(namespace).items()):
         if isinstance(value, FunctionType):
-            setattr(namespace, name, _compiled(value, inner=name not in called))
+            setattr(namespace, name, _compiled(value, more or {}, inner=name not in called))
     return True
 
 
-def _compiled(function: FunctionType, *, inner: bool) -> Any:
+def _compiled(function: FunctionType, more: Mapping[str, Any], *, inner: bool) -> Any:
     """Return numba's function, which it compiles when it is called; an inner one is for other compiled functions."""
     from numba import njit
 
     made = pipelines()
-    options: Any = COMPILE_OPTIONS if made is None else COMPILE_OPTIONS | {"pipeline_class": made[inner]}
+    options: Any = {**COMPILE_OPTIONS, **more} | ({} if made is None else {"pipeline_class": made[inner]})
     if inner:
         options = options | _INNER | ({} if made is None else {"cache": False})
     return compile_without_failing_cache(njit(**options)(function))

@@ -3,6 +3,7 @@
 import numpy as np
 
 from softneck.runtime._layout import Arrays, StateVector, array, cells, value
+from softneck.runtime._products_runtime import product
 from softneck.runtime._random_runtime import random_normal, random_seed
 
 
@@ -62,7 +63,7 @@ def step(
     inputs: motor_setpoint_1..3, load_pitch, load_roll. parameters: noise_std [rad], noise_seed.
     outputs: pitch, roll, pitch_measured, roll_measured, motor_position_1..3.
     """
-    tilt = np.dot(p.T, inputs[: p.motors])  # Eq. 9-11
+    tilt = product(p.T, inputs[: p.motors])  # Eq. 9-11
     for axis in range(p.axes):
         held, own = x.u[axis], x.x[axis]
         for j in range(p.line - 1, 0, -1):

@@ -8,6 +8,7 @@ import numpy as np
 
 from softneck.runtime._layout import Arrays, array
 from softneck.runtime._members_runtime import member_initialise, member_size, member_step
+from softneck.runtime._products_runtime import product
 from softneck.verification._linear_plant_runtime import axis_advance
 
 
@@ -67,7 +68,7 @@ def sweep_run(
             for j in range(count):
                 held[j] = outputs[outputs_at[j]]
                 motors[i, k, j] = held[j]
-            tilt = np.dot(p.T, held)
+            tilt = product(p.T, held)
             for axis in range(m):
                 total = tilt[axis]
                 for other in range(m):

@@ -13,6 +13,7 @@ import numpy as np
 
 from softneck.design.linear._allocation_runtime import allocate
 from softneck.runtime._layout import Arrays, StateVector, array, cells, value
+from softneck.runtime._products_runtime import add_product, product
 from softneck.runtime._rest_runtime import REST
 
 LINEAR_REFERENCE_LIMIT = 0.8  # [rad], as the ports' min and max
@@ -71,7 +72,7 @@ class LinearState(StateVector):
 
 def linear_align(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
     """Choose the state that asks for the held set-points while the reference is where the neck is: no bump."""
-    v = np.dot(p.T, x.held)
+    v = product(p.T, x.held)
     known = np.empty(2 * p.outputs)
     known[: p.outputs] = y
     known[p.outputs :] = v[: p.outputs]
@@ -79,8 +80,8 @@ def linear_align(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
     rest = np.empty(p.outputs + 1)
     rest[: p.outputs] = y
     rest[p.outputs] = v[p.outputs]
-    x.xf[:] = np.dot(p.rest, rest)
-    x.x[:] = np.dot(p.align, known)
+    x.xf[:] = product(p.rest, rest)
+    x.x[:] = product(p.align, known)
 
 
 def linear_finite(inputs: np.ndarray) -> bool:
@@ -119,18 +120,26 @@ def linear_control(p: LinearArrays, parameters: np.ndarray, x: LinearState, inpu
     r = linear_asked(p, p.constants, parameters, inputs)
     # Of now, before the filter moves on: r acts at once where Df lets it.
     rf = linear_reference(p, p.constants, parameters, x.xf, inputs)
-    wanted = np.empty(p.outputs + 1)
-    wanted[: p.outputs] = np.dot(p.C, x.x) + np.dot(p.Dr, rf[: p.outputs]) + np.dot(p.Dy, y)
+    wanted = np.zeros(p.outputs + 1)
+    add_product(p.C, x.x, wanted)
+    add_product(p.Dr, rf, wanted)
+    add_product(p.Dy, y, wanted)
     wanted[p.outputs] = rf[p.outputs]
     # Of other robots set-points may go from a pressure of zero on: co-contraction is raised to that always.
     taut = p.numbers > 1 or parameters[3] > -parameters[0]
     motors = inputs[2 * p.outputs + 1 : 2 * p.outputs + 1 + p.motors]
     allocate(p.T_inverse, wanted, linear_limits(p, parameters), taut, motors, x.held)
     # What the limits took away: the controller's state moves as if it had never been asked for.
-    excess = np.dot(p.T, x.held)[: p.outputs] - wanted[: p.outputs]
+    excess = -wanted
+    add_product(p.T, x.held, excess)
     # Last, as v is of the states of now.
-    x.xf[:] = (np.dot(p.Af, x.xf) + np.dot(p.Bf, r) + REST) - REST
-    ahead = np.dot(p.A, x.x) + np.dot(p.Br, rf[: p.outputs]) + np.dot(p.By, y) + np.dot(p.L, excess)
+    filtered = product(p.Af, x.xf)
+    add_product(p.Bf, r, filtered)
+    x.xf[:] = (filtered + REST) - REST
+    ahead = product(p.A, x.x)
+    add_product(p.Br, rf, ahead)
+    add_product(p.By, y, ahead)
+    add_product(p.L, excess, ahead)
     x.x[:] = (ahead + REST) - REST
 
 
@@ -168,4 +177,6 @@ def linear_reference(
     p: FilterArrays, constants: np.ndarray, parameters: np.ndarray, xf: np.ndarray, inputs: np.ndarray
 ) -> np.ndarray:
     """Return the filtered references (outputs + 1,) of now."""
-    return np.dot(p.Cf, xf) + np.dot(p.Df, linear_asked(p, constants, parameters, inputs))
+    rf = product(p.Cf, xf)
+    add_product(p.Df, linear_asked(p, constants, parameters, inputs), rf)
+    return rf

@@ -14,6 +14,7 @@ import numpy as np
 
 from softneck.design.predictive._scaled_runtime import scaled_listen, scaled_measured, scaled_unit
 from softneck.runtime._layout import Arrays, StateVector, array, cells, value
+from softneck.runtime._products_runtime import product
 
 MPC_NO_BOUND = 1e30
 
@@ -187,7 +188,7 @@ def mpc_listen(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
 
 def mpc_align(p: MpcArrays, x: MpcState, inputs: np.ndarray, measured: bool) -> None:
     """Start as if the neck had always stood where it is under the held set-points: no bump."""
-    v = np.dot(p.T, x.held)
+    v = product(p.T, x.held)
     for i in range(p.outputs):
         for j in range(p.n):
             x.models[i, j] = mpc_driven(p, p.rest, i, j, v)
@@ -274,7 +275,7 @@ def mpc_parameter(p: MpcArrays, x: MpcState, theta: MpcTheta) -> None:
 
 def mpc_predict(p: MpcArrays, x: MpcState) -> None:
     """Move models, past inputs, disturbances and the payload's filter on to the next sample."""
-    v = np.dot(p.T, x.held)
+    v = product(p.T, x.held)
     now = np.empty(p.n)
     for i in range(p.outputs):
         back = int(p.delays[i])

@@ -31,6 +31,7 @@ from softneck.design.linear._linear_parts_runtime import (
 )
 from softneck.identification.linear._ud_runtime import ud_guarded
 from softneck.runtime._layout import array, cells, value
+from softneck.runtime._products_runtime import product
 from softneck.runtime._rest_runtime import REST
 
 # Places in `guards`.
@@ -133,7 +134,7 @@ def step(p: AdaptiveArrays, parameters: np.ndarray, x: AdaptiveState, inputs: np
     x.started = 1.0
     if active:
         linear_control(now, parameters, x, inputs)
-    v = np.dot(p.T, x.held)
+    v = product(p.T, x.held)
     for axis in range(p.outputs):
         adaptive_push(p, x, axis, v[axis], active)
     outputs[:] = x.held
@@ -292,11 +293,11 @@ def adaptive_arrays(p: AdaptiveArrays, x: AdaptiveState) -> LinearArrays:
 
 def adaptive_align(p: AdaptiveArrays, now: LinearArrays, x: AdaptiveState, y: np.ndarray) -> None:
     """Set the model to rest at the present angle and the integral to the held action: a bumpless start."""
-    v = np.dot(p.T, x.held)
+    v = product(p.T, x.held)
     rest = np.empty(p.outputs + 1)
     rest[: p.outputs] = y
     rest[p.outputs] = v[p.outputs]
-    x.xf[:] = np.dot(p.rest, rest)
+    x.xf[:] = product(p.rest, rest)
     for axis in range(p.outputs):
         x.x[axis] = y[axis]
         # v = rf / G_0 + s where ym = y: Dr is 1 / G_0.
