@@ -131,7 +131,7 @@ def _link_parts(module: str, called: str, runtimes: tuple[str, ...]) -> Callable
     lines.append("    return False")  # no part has this index
     text = bundle(module, loops=False, skip=("part_step",)) + "\n".join(lines) + "\n"
     namespace = _import_text(text, compiled=True)
-    # Counting references to the arrays of all parts, at each call of each step, took as long as a light step itself.
+    # Counting references to the arrays of all parts at each call took longer than a light step; rows allocate nothing.
     _compile(namespace, (called,), {"_nrt": False})
     return getattr(namespace, called)
 
@@ -171,7 +171,8 @@ def _compiled(function: FunctionType, more: Mapping[str, Any], *, inner: bool) -
     from numba import njit
 
     made = pipelines()
-    options: Any = {**COMPILE_OPTIONS, **more} | ({} if made is None else {"pipeline_class": made[inner]})
+    # Stated, or a step that is compiled for rows without references would have none either, and cannot allocate.
+    options: Any = {**COMPILE_OPTIONS, "_nrt": True, **more} | ({} if made is None else {"pipeline_class": made[inner]})
     if inner:
         options = options | _INNER | ({} if made is None else {"cache": False})
     return compile_without_failing_cache(njit(**options)(function))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import control
@@ -23,7 +24,7 @@ from softneck.loop import (
 )
 from softneck.loop._faults import FAULT_KINDS, make_fault
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.runtime import Block
+from softneck.runtime import Block, _compile
 
 _KEYS: dict[str, dict[str, Any]] = {
     "sensor_bias": {"size_deg": 2.0}, "sensor_outlier": {"size_deg": 5.0, "share": 0.2, "seed": 3},
@@ -149,3 +150,14 @@ def test_a_part_with_an_advance_of_its_own_is_called(
     observer = Counted(parts["observer"])
     _same(run_loop(loop()), run_loop(loop(observer=observer), compiled=compiled))
     assert observer.calls >= 100  # 2 s at 20 ms
+
+
+def test_a_step_that_the_rows_compile_first_may_allocate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Rows count no references to arrays; numba hands its options down to what it compiles meanwhile.
+    monkeypatch.setattr(_compile, "_cache_folder", lambda: tmp_path)
+    steps = _compile._import_text("import numpy as np\n\ndef step(n):\n    return np.zeros(n).size\n", compiled=True)
+    rows = _compile._import_text("def rows(n):\n    return step(n)\n", compiled=True)
+    _compile._compile(steps, ("step",))
+    rows.step = steps.step  # pyright: ignore[reportAttributeAccessIssue]
+    _compile._compile(rows, ("rows",), {"_nrt": False})
+    assert rows.rows(7) == 7
