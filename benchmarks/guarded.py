@@ -24,8 +24,8 @@ from benchmarks.baseline import SHOWN, TESTS, recorded, records_of_tests, traini
 from softneck.core import load, silent
 from softneck.fmu import build_compiled_fmu
 from softneck.identification import INFINITE, Model, OutputError, validate
+from softneck.identification.models._left_out import folds
 from softneck.identification.selection._auto import _Race, kinds_to_try
-from softneck.identification.selection._left_out import folds
 from softneck.identification.uncertainty._guarded import Guarded
 from softneck.signals import Recording, signal
 from tests.foreign_necks.kept import keep, kept_lines

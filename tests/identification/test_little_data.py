@@ -22,8 +22,7 @@ from softneck.identification import (
     validate,
 )
 from softneck.identification.models._directions import bandwidth_of
-from softneck.identification.selection._examination import other_motion
-from softneck.identification.selection._left_out import all_rows, folds
+from softneck.identification.models._left_out import all_rows, folds, other_motion
 from softneck.robot import Robot
 from softneck.signals import (
     Recording,

@@ -24,15 +24,16 @@ from softneck.core import (
 from softneck.signals import Recording, poor_excitation
 
 from ..models._arrays import members
+from ..models._left_out import Fold, agreement, all_rows, exams, folds, free_runs, other_motion, samples_to_judge
 from ..models._linear_systems import KINDS as LINEAR
 from ..models._model import Model
 from ..models._validity import calibrate_validity
 from ..set_membership._set_membership import noise_si
+from ..structured._greybox import as_found
 from ..uncertainty._guarded import BASES, OF, Guarded, fitted_base
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
-from ._examination import HOLD_OUT, SECOND, SHORT, Examination, Fits, other_motion, second_training, unseen_rows
-from ._left_out import Fold, agreement, all_rows, exams, folds, free_runs, samples_to_judge
+from ._examination import HOLD_OUT, SECOND, SHORT, Examination, Fits, second_training, unseen_rows
 
 EXAM, COLD = "agreement", "cold start"
 # What is in a model file but was not found from data: sizes, tables, copies of rows in another order; and what says how
@@ -418,6 +419,9 @@ class _Race:
             if one.model is None:
                 raise DataError(one.failure)
             model = _settings(kind, self.seed, {}).fit(self.train)
+            if kind == "greybox":
+                again = as_found(_settings(kind, self.seed, _SCREENED[kind]), model)
+                self.short[kind] = again.fit(self.folds[0].train)
             if self.folds[0].judged:
                 model = calibrate_validity(model, self.short[kind], *unseen_rows(self.folds[0]))
             judged = self._validate(kind, model)

@@ -19,17 +19,18 @@ from softneck.robot import Robot
 from softneck.signals import Recording
 
 from ..models._arrays import BOUNDED
+from ..models._left_out import Fold, all_rows, exams, folds, free_runs, other_motion
 from ..models._model import Model
 from ..models._scores import nrmse_fit
 from ..models._validity import calibrate_validity
-from ._left_out import Fold, all_rows, exams, folds, free_runs
+from ..structured._greybox import as_found
 
 HOLD_OUT, SECOND = "hold-out", "second training"
 WITHIN_A_MOTION = ("largest motions", "fastest motions", "later block")
 Fits = Mapping[str, float]
 # Cheaper settings of the same method: fewer starts and steps.
 SHORT: dict[str, dict[str, Any]] = {
-    "greybox": {"evaluations": 15, "sensor_delay": 2},
+    "greybox": {"evaluations": 15, "sensor_delay": 2, "body": "rigid"},
     "nn": {"starts": 1, "iterations": 8, "refine": 6},
 }
 # Kinds that are trained again: in at most twice the time of their own training. `guarded` holds several models.
@@ -104,6 +105,7 @@ def examine(
     parts: dict[str, Fits] = {HOLD_OUT: all_rows(HOLD_OUT, hold_out).fits(model)[0]}
     bounds: dict[str, Any] = {}
     left_out = folds(train, hold_out, other_excitation=False) if model.kind in AGAIN else []
+    settings = as_found(settings, model) if model.kind == "greybox" else settings
     for number, fold in enumerate(left_out):
         progress(number / len(left_out), f"without {fold.judged[0].name}")
         try:
@@ -161,17 +163,3 @@ def coverage(again: Model, recording: Recording, rows: np.ndarray) -> dict[str, 
         "held_pct": dict(zip(names, (100.0 * held).tolist(), strict=True)),
         "width": dict(zip(names, width.tolist(), strict=True)),
     }
-
-
-# Two runs of which a motor's spread or its speed differ by more than this factor are different motions.
-_SAME_MOTION = 1.25
-
-
-def other_motion(recording: Recording) -> bool:
-    """Return whether the runs are of different motions."""
-    moves = [run.set_points for run in recording.runs() if len(run) > 1]
-    if not moves:
-        return False
-    sizes = np.array([[U.std(axis=0), np.diff(U, axis=0).std(axis=0)] for U in moves])
-    low, high = sizes.min(axis=0), sizes.max(axis=0)
-    return bool((high > _SAME_MOTION * low + 1e-9 * high.max()).any())

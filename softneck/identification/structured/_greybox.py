@@ -30,7 +30,7 @@ from ..models._linear_systems import history_array
 from ..models._model import Model
 from ._output_error import SETTLING_S, FitProblem, Found, SearchProgress, intervals
 from ._parameters import BODY_PARAMETERS, PARAMETERS, PAYLOAD_CURVE, PAYLOAD_PARAMETERS, RIGID
-from ._parts import describe_parts, extend, parts_of
+from ._parts import choose_parts, describe_parts, extend, parts_of
 
 # A held input is forgotten after so long [s of a neck's time].
 _MEMORY_S = 3.0
@@ -52,12 +52,13 @@ class GreyBox:
         sensor_delay: dead time of the inclinometer in samples; None tries 1 to 4, of a slower robot as
             many more.
         body: what it has beside these numbers: nothing ("rigid"), some of anisotropy, stop (of compression),
-            softening, creep and tendons (their angles and arms) joined by "+", or "all".
+            softening, creep and tendons (their angles and arms) joined by "+", "all", or ("auto") those that predict
+            motions left out of a training better.
     """
 
     evaluations: int = 40
     sensor_delay: int | None = None
-    body: str = "rigid"
+    body: str = "auto"
 
     def __post_init__(self) -> None:
         require_whole("evaluations", self.evaluations, 1, 10_000)
@@ -87,7 +88,11 @@ class GreyBox:
         try:
             for found in problem.delayed(self.sensor_delay, self.evaluations, tell):  # noqa: B007
                 pass
-            found = extend(found, parts_of(self.body), self.evaluations, tell)
+            parts = parts_of(self.body)
+            if parts is None:
+                found, said = choose_parts(found, scaled, self.evaluations, tell)
+            else:
+                found = extend(found, parts, self.evaluations, tell)
         except KeyboardInterrupt:
             said["interrupted"] = INTERRUPTED
             if not found.x.size and tell.best is not None:
@@ -100,6 +105,11 @@ class GreyBox:
         model = _model(self, found.problem, scaled, found.delay, found.x)
         progress(1.0, "done")
         return replace(model, findings={**model.findings, **said})
+
+
+def as_found(settings: GreyBox, model: Model) -> GreyBox:
+    """Return the settings for other rows of the robot that `model` is of: with its dead time and its optional parts."""
+    return replace(settings, sensor_delay=int(model.findings["sensor_delay"]), body=str(model.settings["body"]))
 
 
 def _model(settings: GreyBox, problem: FitProblem, scaled: ScaledData, delay: int, x: Vector) -> Model:
@@ -121,6 +131,7 @@ def _model(settings: GreyBox, problem: FitProblem, scaled: ScaledData, delay: in
         "memory": memory_array(_MEMORY_S, problem.sample_time),
         **({"payload": load} if load.size else {}),
     }
+    settings = replace(settings, body="+".join(problem.parts) or "rigid")
     table = intervals(problem, x, delay)
     for number, row in zip(problem.numbers, table, strict=True):
         if number.is_rate:

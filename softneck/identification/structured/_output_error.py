@@ -107,6 +107,11 @@ class FitProblem:
         """Whether it bends in two directions."""
         return self.runs[0][3].shape[1] == 2
 
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The optional parts whose numbers are searched."""
+        return tuple(part for part, numbers in PARTS.items() if numbers[0] in self.numbers)
+
     def with_parts(self, *parts: str) -> FitProblem:
         """Return the problem with the numbers of optional parts."""
         return replace(self, numbers=(*self.numbers, *(number for part in parts for number in PARTS[part])))

@@ -3,37 +3,125 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from softneck.core import SettingsError, Vector
+from softneck.signals import Recording
 
+from ..models._fitting import ScaledData
+from ..models._left_out import Fold, Judged, folds, other_motion
+from ..models._scores import nrmse_fit
 from ._output_error import FitProblem, Found, SearchProgress
 from ._parameters import PARTS
 
+GEOMETRY = "tendons"  # shows in every motion
+# Steps of a search on a part of the rows, from what was found on all.
+_STEPS = 4
+# What a part must gain [points]: seeds of the noise move fits by as much. With one motion what was left out resembles
+# the rest: laws of amplitude and time must also gain this share of what is missing to 100 %.
+_LEAST_GAIN, _LEAST_SHARE = 0.5, 0.15
 
-def parts_of(body: str) -> tuple[str, ...]:
-    """Return the parts that the setting `body` names: "rigid" none, "all", or some joined by plus signs."""
-    if body == "rigid":
-        return ()
+
+def parts_of(body: str) -> tuple[str, ...] | None:
+    """Return the parts that the setting `body` names: "rigid" none, "all", some joined by plus signs; None: "auto"."""
+    if body in ("auto", "rigid"):
+        return None if body == "auto" else ()
     parts = tuple(PARTS) if body == "all" else tuple(body.split("+"))
     if len(set(parts)) < len(parts) or not set(parts) <= set(PARTS):
-        raise SettingsError(f"`body` must be rigid, all, or some of {', '.join(PARTS)} joined by `+`; got {body!r}.")
+        raise SettingsError(
+            f"`body` must be auto, rigid, all, or some of {', '.join(PARTS)} joined by `+`; got {body!r}."
+        )
     return parts
 
 
 def extend(found: Found, parts: Sequence[str], evaluations: int, tell: SearchProgress) -> Found:
-    """Return the fit with the numbers of `parts`, searched from what was found without.
-
-    Those that a robot cannot have are left out: tendons of other robots, anisotropy in a plane.
-    """
-    can = {"tendons": found.problem.has_neck_tendons, "anisotropy": found.problem.has_two_outputs}
-    able = [part for part in parts if can.get(part, True)]
+    """Return the fit with the numbers of `parts`, searched from what was found without."""
+    able = [part for part in parts if part in _able(found.problem)]
+    if not able:
+        return found
     larger = found.problem.as_sure_as(found.x, found.delay).with_parts(*able)
     new = larger.numbers[len(found.x) :]
     tell.what = "parts"
     x = np.concatenate([found.x, [number.encode(number.guess) for number in new]])
-    return larger.search(x, found.delay, evaluations, tell) if able else found
+    return larger.search(x, found.delay, evaluations, tell)
+
+
+def _able(problem: FitProblem) -> list[str]:
+    """Return the parts that a robot can have: no tendons of other robots, no anisotropy in a plane."""
+    can = {GEOMETRY: problem.has_neck_tendons, "anisotropy": problem.has_two_outputs}
+    return [part for part in PARTS if can.get(part, True)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    """A fold, and what was found on it with some parts; judged: what it left out, and the problem to simulate that."""
+
+    found: Found
+    judged: list[tuple[Judged, FitProblem]]
+
+    def extended(self, part: str, evaluations: int, tell: SearchProgress) -> _Trial:
+        return replace(self, found=extend(self.found, [part], evaluations, tell))
+
+    def fit(self) -> float:
+        """Return the worst fit of an output on what was left out [%]."""
+        worst = np.inf
+        for judged, problem in self.judged:
+            problem = replace(problem, numbers=self.found.problem.numbers)
+            Y = np.concatenate([Y for _, Y in problem.simulate(self.found.x, self.found.delay)])
+            y = np.where(judged.rows[:, None], judged.recording.outputs, np.nan)
+            fits = [nrmse_fit(*pair) for pair in zip(y.T, Y.T, strict=True)]
+            worst = min(worst, *(-np.inf if np.isnan(Y).any() else fit for fit in fits if fit == fit))
+        return worst
+
+
+def choose_parts(
+    found: Found, scaled: ScaledData, evaluations: int, tell: SearchProgress
+) -> tuple[Found, dict[str, object]]:
+    """Return the fit with the parts that motions left out confirm, and for each the worst fit to these [%].
+
+    Forward selection: of all parts the one whose fits to what trainings did not see have the best worst, as long as it
+    gains. Left out are whole runs where they are of different motions, else the largest and the fastest motions.
+    """
+    left_out, several = folds(scaled.data, scaled.data, other_excitation=False), other_motion(scaled.data)
+    left_out = left_out[1:] if several else left_out
+    trials = [_trial(found, scaled, fold, min(evaluations, _STEPS), tell) for fold in left_out]
+    least = min((one.fit() for one in trials), default=np.inf)
+    left, kept = _able(found.problem), {"rigid": least}
+    while left and trials:
+        tried: dict[str, list[_Trial]] = {}
+        for part in left:
+            tell.what = f"parts: {part}"
+            tried[part] = [one.extended(part, min(evaluations, _STEPS), tell) for one in trials]
+        fits = {part: min(one.fit() for one in extended) for part, extended in tried.items()}
+        more = {part: 0.0 if several or part == GEOMETRY else _LEAST_SHARE * (100.0 - least) for part in left}
+        good = [part for part in left if fits[part] > least + max(_LEAST_GAIN, more[part])]
+        if not good:
+            break
+        best = max(good, key=lambda part: fits[part])
+        left = [part for part in left if part != best and fits[part] > least]
+        trials, least = tried[best], fits[best]
+        kept[best] = least
+    if len(kept) == 1:
+        return found, {}
+    tell.what = "parts"
+    larger = found.problem.as_sure_as(found.x, found.delay).with_parts(*list(kept)[1:])
+    # A simulation that diverged has no number.
+    said: dict[str, object] = {"parts": {part: max(fit, 0.0) for part, fit in kept.items()}}
+    return larger.search(trials[0].found.x, found.delay, evaluations, tell), said
+
+
+def _trial(found: Found, scaled: ScaledData, fold: Fold, evaluations: int, tell: SearchProgress) -> _Trial:
+    def problem_of(recording: Recording) -> FitProblem:
+        whole, own = found.problem, FitProblem.of(replace(scaled, data=recording))
+        return replace(own, numbers=whole.numbers, payload_range=whole.payload_range, reach=whole.reach)
+
+    problem = problem_of(fold.train)
+    return _Trial(
+        problem.search(found.x, found.delay, evaluations, tell),
+        [(judged, problem_of(judged.recording)) for judged in fold.judged],
+    )
 
 
 def describe_parts(problem: FitProblem, x: Vector, second: float) -> str:

@@ -36,6 +36,7 @@ from ..models._model import WARM_UP, Model
 from ..models._validity import with_validity_region
 from ..networks._network import Network
 from ..set_membership._set_membership import SetMembership
+from ..structured._greybox import as_found
 from ..structured._play import Play
 
 # One thread for each matrix product: the processes share the cores already.
@@ -152,8 +153,8 @@ def fitted_base(kind: str, recording: Recording, settings: Any = None) -> Base:
     settings = resolve(KINDS[kind].settings)() if settings is None else settings
     model = settings.fit(recording)
     parts = left_out(recording, _BLOCKS)
-    # Its dead time is a property of the sensor: known once, it need not be searched for again.
-    again = replace(settings, sensor_delay=int(model.findings["sensor_delay"])) if kind == "greybox" else settings
+    # Its dead time and parts are properties of the robot: known once, they need not be searched for again.
+    again = as_found(settings, model) if kind == "greybox" else settings
     error = left_out_error(again.fit, [parts[i] for i in _TEST_BLOCKS])
     spread = np.nanstd(recording.outputs, axis=0)
     return Base(model, error, 100.0 * (1.0 - error / spread))

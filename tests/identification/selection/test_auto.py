@@ -12,6 +12,7 @@ from softneck.core import DataError, SettingsError, load, silent
 from softneck.identification import Choice, Model, Network, OutputError, Play, Rls, SetMembership, choose
 from softneck.identification.models._arrays import members
 from softneck.identification.models._fitting import known_rows, row_hashes
+from softneck.identification.models._left_out import agreement, exams, folds, weighted_median
 from softneck.identification.selection import _auto
 from softneck.identification.selection._auto import (
     ALIKE,
@@ -26,7 +27,6 @@ from softneck.identification.selection._auto import (
     kinds_to_try,
     numbers_of,
 )
-from softneck.identification.selection._left_out import agreement, exams, folds, weighted_median
 from softneck.identification.uncertainty import _guarded
 from softneck.identification.uncertainty._guarded import Base, Guarded
 from softneck.signals import Recording, concatenate

@@ -10,6 +10,7 @@ import pytest
 
 from softneck.core import DataError, silent
 from softneck.identification import Model, Play, SetMembership, identify, with_tolerance
+from softneck.identification.models._left_out import folds
 from softneck.identification.models._validity import calibrate_validity, tolerance_of
 from softneck.identification.selection._examination import (
     Examination,
@@ -18,7 +19,6 @@ from softneck.identification.selection._examination import (
     shortened,
     unseen_rows,
 )
-from softneck.identification.selection._left_out import folds
 from softneck.identification.structured._greybox import GreyBox
 from softneck.robot import Robot
 from softneck.signals import Recording, concatenate
@@ -90,7 +90,8 @@ def test_the_worst_of_what_is_no_number(fits: dict[str, dict[str, float]], worst
 
 
 def test_given_settings_stay_in_the_short_form() -> None:
-    assert shortened(GreyBox(sensor_delay=3), "greybox") == GreyBox(sensor_delay=3, evaluations=15)
+    assert shortened(GreyBox(sensor_delay=3), "greybox") == GreyBox(sensor_delay=3, evaluations=15, body="rigid")
+    assert shortened(GreyBox(body="creep"), "greybox") == GreyBox(body="creep", evaluations=15, sensor_delay=2)
     assert shortened(Play(), "play") == Play()
 
 

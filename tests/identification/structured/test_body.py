@@ -131,17 +131,31 @@ def test_a_link_at_its_stop_is_compressed_a_tenth_as_far() -> None:
 
 @pytest.fixture(scope="module")
 def creeping() -> Model:
-    return GreyBox(sensor_delay=2, body="creep").fit([recording(CREEP, "mixed", 1), recording(CREEP, "eq22", 2)])
+    return GreyBox(sensor_delay=2).fit([recording(CREEP, "mixed", 1), recording(CREEP, "eq22", 2)])
 
 
 @pytest.mark.slow
 def test_the_creep_behind_its_own_equations_is_found(creeping: Model) -> None:
     found = {row["name"]: row for row in creeping.findings["numbers"]}
+    # Each motion confirms creep, before any other part, when the other is trained on.
+    assert "creep" in creeping.settings["body"].split("+")
+    fits = creeping.findings["parts"]
+    assert list(fits)[:2] == ["rigid", "creep"]
+    assert fits["creep"] > fits["rigid"] + 0.5
     # Within 20 %: stiffness and creep share what the bend says of both.
     assert found["creep"]["value"] == pytest.approx(0.8, rel=0.2)
     assert "softening" not in found
     assert "time constant" in creeping.findings["found"]
     assert "time constant" in creeping.summary()
+
+
+@pytest.mark.slow
+def test_a_rigid_body_gets_no_part() -> None:
+    whole = GreyBox(sensor_delay=2).fit(recording(RIGID, "mixed", 1))
+    assert whole.settings["body"] == "rigid"
+    assert "parts" not in whole.findings
+    same = GreyBox(sensor_delay=2, body="rigid").fit(recording(RIGID, "mixed", 1))
+    np.testing.assert_array_equal(whole.arrays["neck"], same.arrays["neck"])
 
 
 @pytest.mark.slow
@@ -155,7 +169,7 @@ def test_its_file_keeps_the_body(creeping: Model, tmp_path: Path) -> None:
         load(tmp_path / "spoiled.npz")
 
 
-@pytest.mark.parametrize("parts", ["", "foam", "creep+creep", "rigid+creep"])
+@pytest.mark.parametrize("parts", ["", "foam", "creep+creep", "rigid+creep", "auto+creep"])
 def test_parts_that_do_not_exist_are_refused(parts: str) -> None:
-    with pytest.raises(SettingsError, match="rigid, all, or some of anisotropy, stop, softening, creep, tendons"):
+    with pytest.raises(SettingsError, match="auto, rigid, all, or some of anisotropy, stop, softening, creep, tendons"):
         GreyBox(body=parts)

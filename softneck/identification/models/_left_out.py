@@ -16,10 +16,10 @@ import numpy as np
 from softneck.core import Matrix, Vector
 from softneck.signals import Recording, concatenate
 
-from ..models._directions import make_test_motions, time_constant_of
-from ..models._fitting import MIN_ROWS
-from ..models._model import WARM_UP, Model
-from ..models._scores import nrmse_fit
+from ._directions import make_test_motions, time_constant_of
+from ._fitting import MIN_ROWS
+from ._model import WARM_UP, Model
+from ._scores import nrmse_fit
 
 _EXAM_LENGTH_S = 30.0
 # A model that is right to a percent weighs no more than that.
@@ -232,3 +232,17 @@ def _block_sums(squares: Matrix) -> Matrix:
     """Return the sums (blocks, outputs) over consecutive rows (time, outputs), samples that are NaN left out."""
     borders = np.arange(0, len(squares), _BLOCK_SAMPLES)
     return np.add.reduceat(np.nan_to_num(squares), borders, axis=0)
+
+
+# Two runs of which a motor's spread or its speed differ by more than this factor are different motions.
+_SAME_MOTION = 1.25
+
+
+def other_motion(recording: Recording) -> bool:
+    """Return whether the runs are of different motions."""
+    moves = [run.set_points for run in recording.runs() if len(run) > 1]
+    if not moves:
+        return False
+    sizes = np.array([[U.std(axis=0), np.diff(U, axis=0).std(axis=0)] for U in moves])
+    low, high = sizes.min(axis=0), sizes.max(axis=0)
+    return bool((high > _SAME_MOTION * low + 1e-9 * high.max()).any())
