@@ -256,7 +256,7 @@ def _step(task: _Task, plant: SimulationModel, number: int, kg: float, orientati
     size = scale.si(float(asked.sim["size_deg"]))
     shares = direction(orientation, robot)
     step = RobotReference(kind="step", values=tuple(size * s for s in shares), at=at)
-    block, connections = scale_loop_gain(task.controller, task.observer, outputs)
+    block, connections, wanted = scale_loop_gain(task.controller, task.observer, outputs)
     parameters = {f"share_{axis}": float(s) for axis, s in zip(outputs, draws.share, strict=True)}
     # A recording that is noisier than what is asked is believed.
     noise = max(scale.si(float(asked.step["noise_deg"])), float(draws.noise.max()))
@@ -268,7 +268,7 @@ def _step(task: _Task, plant: SimulationModel, number: int, kg: float, orientati
         duration=at + half + (half if _has_load(task) else 0.0), order=task.order, robot=robot,
         **plant.carrying(kg), others={"louder": BlockPart(block)}, other_parameters={"louder": parameters},
         connections=connections, faults=tuple(_load(task, int(np.argmax(np.abs(shares))), at + half)),
-        other_inputs={"louder": {p.name: 0.0 for p in block.inputs if p.name.endswith("_wanted")}},
+        other_inputs={"louder": wanted},
     )  # fmt: skip
     name_of = scale.name_of
     try:

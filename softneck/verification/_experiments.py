@@ -284,7 +284,7 @@ class Experiment:
         chosen = [self.axes in (axis, _ALL_AXES) for axis in loop.outputs]
         parameters = {f"gain_{axis}": gain if on else 1.0 for axis, on in zip(loop.outputs, chosen, strict=True)}
         parameters |= {f"delay_{axis}": delay if on else 0.0 for axis, on in zip(loop.outputs, chosen, strict=True)}
-        block, connections = scale_loop_gain(loop.controller, loop.observer, loop.outputs, loop.samples)
+        block, connections, wanted = scale_loop_gain(loop.controller, loop.observer, loop.outputs, loop.samples)
         # Step towards upright, so that no neck leaves its reach.
         kick = np.array([-self.amplitude if p > 0.0 else self.amplitude for p in self.posture]) * chosen
         posture = tuple(float(a + b) for a, b in zip(middle_of(loop.robot), self.posture, strict=True))
@@ -297,8 +297,7 @@ class Experiment:
                 duration=loop.time * (REST_S + _TRANSIENT_S + 2.0 * _WINDOW_S), order=loop.order,
                 **loop.constants, other_parameters={"louder": parameters},
                 others={"louder": BlockPart(block)}, connections=connections,
-                # The reference of a rate is zero.
-                other_inputs={"louder": {p.name: 0.0 for p in block.inputs if p.name.endswith("_wanted")}},
+                other_inputs={"louder": wanted},
             ),
             compiled=loop.compiled,
         )  # fmt: skip
@@ -340,8 +339,8 @@ class _Kicked:
 
 def scale_loop_gain(
     controller: Block, observer: Block | None, outputs: tuple[str, ...] = _NECK.outputs.names, samples: int = 1
-) -> tuple[Block, dict[str, str]]:
-    """Return a block after the sensor that scales the loop gain or adds delay, and its connections.
+) -> tuple[Block, dict[str, str], dict[str, float]]:
+    """Return a block after the sensor that scales the loop gain or adds delay, its connections and constants.
 
     `samples` is the number of samples per unit of delay.
     """
@@ -371,7 +370,9 @@ def scale_loop_gain(
         ),
     )  # fmt: skip
     connections = {f"{role}.{seen[name]}": f"louder.{name}_measured_seen" for name in read}
-    return block, connections | connections_without_preview(controller)
+    # At rest, where these loops end, the reference of a rate is zero.
+    wanted = {port.name: 0.0 for port in references if port.name.endswith("_wanted")}
+    return block, connections | connections_without_preview(controller), wanted
 
 
 def connections_without_preview(controller: Block) -> dict[str, str]:

@@ -82,7 +82,7 @@ class Verification(ReprMixin):
     necks: list[PlantSource]
     requirements: Requirements
     files: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-    observer: bool = False
+    observer: bool
     wall_time: float = 0.0
     tested: Mapping[str, Any] = field(default_factory=dict)
 

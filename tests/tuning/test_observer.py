@@ -95,3 +95,19 @@ def test_another_range_of_the_motors_is_another_search(task: Task) -> None:
     robot = Robot.from_dict(task.robot.as_dict() | {"motors": task.robot.as_dict()["motors"] | {"rate_limit": 1.0}})
     assert robot.hash == task.robot.hash
     assert digest_of(replace(task, robot=robot), ("pi",), None) != digest_of(task, ("pi",), None)
+
+
+def test_in_which_order_things_are_asked_is_no_other_search(task: Task) -> None:
+    """Tables, the robot's keys and the metrics of `track` may stand in any order in their files."""
+
+    def turned(value: Any) -> Any:
+        return {k: turned(v) for k, v in reversed(value.items())} if isinstance(value, dict) else value
+
+    asked = task.asked
+    certificate = replace(
+        asked.certificate,
+        **{name: turned(dict(getattr(asked.certificate, name))) for name in ("uncertainty", "sampling", "step", "sim")},
+    )
+    other = replace(task, asked=replace(asked, track=turned(dict(asked.track)), certificate=certificate))
+    assert digest_of(other, ("pi",), None) == digest_of(task, ("pi",), None)
+    assert digest_of(replace(task, seed=task.seed + 1), ("pi",), None) != digest_of(task, ("pi",), None)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError
+from softneck.estimation import KalmanSettings
 from softneck.loop import BlockPart
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block
@@ -36,7 +37,7 @@ from softneck.verification._experiments import (
 from softneck.verification._linear import LinearLaw, margins
 from softneck.verification._plants import Plants, all_plants, source_of_family
 
-from .necks import TS, family, pi
+from .necks import TS, family, linear_neck, pi
 
 
 def over(plants: Plants, row: int, *, cross: float = 0.0) -> LoopUnderTest:
@@ -234,7 +235,8 @@ def test_a_quieter_loop_oscillates_by_more_than_what_late_axes_do_to_each_other(
 def test_each_channel_is_late_louder_and_disturbed_by_its_own_numbers() -> None:
     """Against the definition written out: a line between samples, and d[k+1] = keep d[k] + share dy[k] n[k]."""
     controller = pi().block()
-    block, _ = scale_loop_gain(controller, None)
+    block, _, wanted = scale_loop_gain(controller, None)
+    assert wanted == {}
     part, axes = BlockPart(block), ("pitch", "roll")
     rng = np.random.default_rng(3)
     y, r = rng.standard_normal((20, 2)), rng.standard_normal((20, 2))
@@ -260,6 +262,21 @@ def test_each_channel_is_late_louder_and_disturbed_by_its_own_numbers() -> None:
     for before, after in pairwise(moved):
         assert after[0] == pytest.approx(0.9 * before[0], rel=1e-12)
         assert after[1] == 0.0
+
+
+def test_at_rest_on_its_reference_a_loop_does_not_notice_its_gain() -> None:
+    """Rates of a gyro too: their reference is zero, so a gain other than one moves nothing."""
+    observer = KalmanSettings(form="gyro").design(linear_neck()).block()
+    block, connections, wanted = scale_loop_gain(pi().block(), observer)
+    read = [port.name for port in block.inputs if port.name.endswith("_measured")]
+    assert read == ["pitch_measured", "roll_measured", "pitch_rate_measured", "roll_rate_measured"]
+    assert connections == {f"observer.{name}": f"louder.{name}_seen" for name in read}
+    at_rest = {"pitch_measured": 0.3, "pitch_reference": 0.3, "roll_measured": -0.2, "roll_reference": -0.2,
+               "pitch_rate_measured": 0.0, "roll_rate_measured": 0.0, **wanted}  # fmt: skip
+    part = BlockPart(block)
+    part.start(0.0, {"gain_pitch": 1.7, "gain_roll": 0.4})
+    seen = part.step(0.0, np.array([at_rest[port.name] for port in block.inputs]))
+    np.testing.assert_array_equal(seen, [0.3, -0.2, 0.0, 0.0])
 
 
 def test_an_experiment_leads_to_its_posture_waits_and_kicks() -> None:

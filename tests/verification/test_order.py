@@ -158,14 +158,14 @@ def test_a_verification_holds_where_none_fails_and_counts_what_is_not_computed(h
                                  block=SimpleNamespace(sample_time=TS, kind="pi"))  # fmt: skip
     files = {"controller": ("pi.npz", "a" * 64)}
     found = Verification(verdicts=verdicts, evidence=evidence, controller=under, necks=[], files=files,
-                         requirements=make_requirements({}))  # fmt: skip
+                         observer=holds[0] is True, requirements=make_requirements({}))  # fmt: skip
     assert found.holds is (False not in holds)
     assert [verdict.worst["row"] for verdict in found.failed] == [k for k, value in enumerate(holds) if value is False]
     assert found.summary().startswith("all" if all(holds) else f"{holds.count(True)} of {len(holds)} requirements hold")
     assert (", 1 is not computed" in found.summary()) is (None in holds)
     assert "parallel order: 2 samples of delay" in found.order_words()
     said = found.contents({0: Path("worst.toml")})
-    assert said["holds"] is found.holds
+    assert (said["holds"], said["observer"]) == (found.holds, holds[0] is True)
     assert [row["holds"] for row in said["requirements"]] == holds
     assert [row.get("note") for row in said["requirements"]] == [None if v is not None else "open" for v in holds]
     assert [row.get("loop") for row in said["requirements"]] == ["worst.toml", *[None] * (len(holds) - 1)]
@@ -178,7 +178,7 @@ def test_a_verification_holds_where_none_fails_and_counts_what_is_not_computed(h
     other = Robot.preset("antagonist")
     under.robot = other
     scale = Scale(robot=other, time=3.0, size=2.0)
-    found = Verification(verdicts=verdicts, evidence=evidence, controller=under, necks=[],
+    found = Verification(verdicts=verdicts, evidence=evidence, controller=under, necks=[], observer=False,
                          requirements=make_requirements({}, scale=scale))  # fmt: skip
     said = found.contents()
     assert said["robot"] == {"name": "antagonist", "hash": other.hash}
@@ -498,7 +498,7 @@ def test_the_worst_plant_of_each_requirement_is_written_as_what_it_is(monkeypatc
     under: Any = SimpleNamespace(robot=Robot.preset(), block="block")
     evidence: Any = None
     necks: Any = [SimpleNamespace(weights="W"), SimpleNamespace(weights="V")]
-    found = Verification(verdicts=verdicts, evidence=evidence, controller=under, necks=necks,
+    found = Verification(verdicts=verdicts, evidence=evidence, controller=under, necks=necks, observer=True,
                          requirements=make_requirements({}))  # fmt: skip
     files = found.write_worst("to", controller="c.npz", observer="o.npz", force=True)
     assert files == {0: Path("linear"), 1: Path("linear"), 2: Path("neck")}

@@ -532,3 +532,17 @@ def test_the_best_linear_fit_is_of_each_output_on_its_own_rows() -> None:
     for rows, known in ((30, True), (29, False)):
         few = np.where(np.arange(200)[:, None] < rows, y, math.nan)
         assert [value is not None for value in _baselines._fits(X, few)] == [known] * 2
+
+
+def test_a_start_that_decays_as_slowly_as_0_1_to_6_4_scaled_seconds_is_met_in_every_segment() -> None:
+    """Seven time constants, an octave apart; one less would blame a model for the state that a segment begins in."""
+    part: Any = SimpleNamespace(recording=np.zeros(400))
+    columns = _baselines._decay_columns([part, part], 0.02)
+    assert columns.shape == (800, 14)
+    assert not columns[:400, 7:].any()
+    assert not columns[400:, :7].any()
+    for seconds in 0.1 * 2.0 ** np.arange(7):
+        start = np.exp(-0.02 * np.arange(400) / seconds)
+        for rows, own in ((slice(0, 400), slice(0, 7)), (slice(400, 800), slice(7, 14))):
+            left = start - columns[rows, own] @ np.linalg.lstsq(columns[rows, own], start)[0]
+            assert np.abs(left).max() < 1e-9  # rounding, through columns that are nearly alike
