@@ -315,13 +315,14 @@ def test_the_front_keeps_what_none_beats_margins_upwards() -> None:
 
 
 @pytest.mark.parametrize(
-    ("drawn", "stated", "heaviest", "told"), [(("d",), (), 0.0, True), (("d",), ("sim.payloads_kg",), 0.0, False),
-                                              (("d",), (), 1.0, False), ((), (), 0.0, False)]
+    ("drawn", "stated", "asked", "told"),
+    [(("d",), (), [0.0], True), (("d",), ("sim.payloads_kg",), [0.0], False), (("d",), (), [1.0], False),
+     (("d",), (), [0.0, 1.0], False), (("d",), (), [1.0, 0.0], False), ((), (), [0.0], False)],
 )  # fmt: skip
 def test_a_default_payload_that_was_not_recorded_is_told(
-    drawn: tuple[str, ...], stated: tuple[str, ...], heaviest: float, told: bool
+    drawn: tuple[str, ...], stated: tuple[str, ...], asked: list[float], told: bool
 ) -> None:
-    task = _task(sim={"payloads_kg": [heaviest]}, own={}, robot=Robot.preset())
+    task = _task(sim={"payloads_kg": asked}, own={}, robot=Robot.preset())
     task.drawn, task.asked.track, task.asked.stated = drawn, {"delay_ms": 0.0}, frozenset(stated)
     found = told_conditions(task, [], TS)
     assert list(found) == ["payload 1 kg"] * told

@@ -20,6 +20,7 @@ from softneck.loop.default_limits import NECK_RISE_S
 from softneck.report._tune import _toml_table
 from softneck.robot import TIME_CONSTANT, Robot
 from softneck.tuning._requirements import (
+    _TRACK_NUMBERS,
     USUAL_RISE,
     check_feasibility,
     default_rise,
@@ -120,6 +121,18 @@ def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
 def test_bad_requirements_are_refused_in_a_line(table: dict, match: str) -> None:
     with pytest.raises(SettingsError, match=match):
         make_tune_requirements(table)
+
+
+@pytest.mark.parametrize("key", _TRACK_NUMBERS)
+def test_settings_of_the_additional_loops_have_their_range(key: str) -> None:
+    low, high, _ = _TRACK_NUMBERS[key]
+    assert (low, high) == {
+        "small_part": (0.05, 1.0), "noise_deg": (0.0, 10.0), "delay_ms": (0.0, 1e9), "circle_deg": (0.1, 40.0),
+        "circle_rad_s": (0.01, 20.0),
+    }[key]  # fmt: skip
+    for value in (low - 0.01 * high, low - 1e-9, math.nextafter(high, math.inf), math.nan, math.inf, -math.inf):
+        with pytest.raises(SettingsError, match=key):
+            make_tune_requirements({"track": {key: value}})
 
 
 def test_a_file_says_what_differs(tmp_path: Path) -> None:

@@ -114,13 +114,15 @@ def test_frames_that_only_a_master_sends_are_another_master() -> None:
     for identifier in range(0x800):
         bus = Fieldbus(settings)
         # An empty frame of a drive has the wrong length, and is no master's.
-        told = [event.name for event in bus.receive(0.0, [Frame(identifier, b"")]) if event.name != "frame_length"]
-        assert told == (["second_master"] if identifier in ours else []), hex(identifier)
+        told = [event for event in bus.receive(0.0, [Frame(identifier, b"")]) if event.name != "frame_length"]
+        assert [event.name for event in told] == (["second_master"] if identifier in ours else []), hex(identifier)
+        assert all(event.detail == f"frame {identifier:03X}h, not sent by us" for event in told)
     drives = [base + node for base in (0x080, 0x180, 0x700) for node in settings.nodes]
     for identifier in range(0x800):
         bus = Fieldbus(settings)
-        told = [event.name for event in bus.receive(0.0, [Frame(identifier, b"", remote=True)])]
-        assert told == (["second_master"] if identifier in {*ours, *drives} else []), hex(identifier)
+        told = [(event.name, event.detail) for event in bus.receive(0.0, [Frame(identifier, b"", remote=True)])]
+        assert [name for name, _ in told] == (["second_master"] if identifier in {*ours, *drives} else [])
+        assert all(text == f"request {identifier:03X}h, not sent by us" for _, text in told)
 
 
 def test_emergencies_are_told_with_what_they_say_and_limits_are_none() -> None:
