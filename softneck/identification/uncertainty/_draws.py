@@ -36,8 +36,9 @@ DRAWS = 59
 SEARCH_DRAWS, ATTEMPTS = 8, 4
 #: Share of held-out samples that the band must cover.
 LEVEL = 0.95
-# Last part of each run, held out from the fit; rows of each run that are used at most [s of a neck's time].
-_HELD_OUT, _MOST_S = 0.25, 60.0
+# Last part of each run, held out from the fit; rows of each run that are used at most [s of a neck's time]: all of
+# `mixed`, whose parts are different motions.
+_HELD_OUT, _MOST_S = 0.25, 150.0
 # Segments of held-out motions: usual, shortest (10, 2.5 time constants) [s of a neck's time], least rows of one.
 _SEGMENT_S, _LEAST_SEGMENT_S, _LEAST_ROWS = 2.0, 0.5, 20
 # Factors on the deviations of the fit, of which the sharpest that explain the held-out motions are taken.
@@ -179,9 +180,9 @@ def make_draws(
     """Return draws of a robot from its recordings.
 
     Models are fitted to the first three quarters of each run: for robots that tendons bend the grey box without and
-    with its optional parts, else kind `play`. The model and the factor on the deviations of its numbers are those that
-    predict the last quarters best, by the continuous ranked probability score (Gneiting and Raftery 2007, J. Am. Stat.
-    Assoc. 102:359). What the nearest draw leaves over there, less the sensor's noise, is the disturbance; it is raised
+    with its optional parts, else kind `play`. The model is the one that predicts the last quarters best, by the
+    continuous ranked probability score (Gneiting and Raftery 2007, J. Am. Stat. Assoc. 102:359); the factor on the
+    deviations of its numbers is the smallest within one standard error of the best (Breiman et al. 1984, sec. 3.4). What the nearest draw leaves over there, less the sensor's noise, is the disturbance; it is raised
     until the band covers `LEVEL` of the samples at every amplitude.
 
     Args:
@@ -201,18 +202,17 @@ def make_draws(
     train, held = _split(whole, second)
     sources = _sources(train, lambda done, text: progress(0.7 * done, f"draws: {text}"))
     motions = _Motions.of(held, sources[0].model, second)
-    best: tuple[float, Source, float, np.ndarray] | None = None
+    tried: list[tuple[Vector, Source, float, np.ndarray]] = []
     for number, (source, factor) in enumerate(product(sources, _FACTORS)):
         progress(0.7 + 0.15 * number / (len(sources) * len(_FACTORS)), f"draws: deviations times {factor:g}")
         rng = np.random.default_rng([seed, 0])
         trial = [source.draw(rng) for _ in range(_CALIBRATION_DRAWS)]
         Y = replace(motions, model=source.model).simulate([source.arrays(draw, factor) for draw in trial])
-        score = motions.score(Y)
-        if best is None or score < best[0]:
-            best = (score, source, factor, Y)
-    if best is None or not math.isfinite(best[0]):
+        tried.append((motions.scores(Y), source, factor, Y))
+    best, winner = min(((scores, source) for scores, source, _, _ in tried), key=lambda item: float(item[0].mean()))
+    if not math.isfinite(float(best.mean())):
         raise DataError("no draw has a finite simulation on the held-out motions; record longer.")
-    _, source, factor, Y = best
+    _, source, factor, Y = next(item for item in tried if item[1] is winner and _no_worse(item[0], best))
     share, keep = motions.disturbance(Y)
     more = next((more for more in _MORE if motions.covers(Y, more * share, keep)), _MORE[-1])
     rows = []
@@ -227,6 +227,13 @@ def make_draws(
         coverage=motions.coverage(Y, more * share, keep),
         conditions={**made, "motion": _motion(whole)},
     )  # fmt: skip
+
+
+def _no_worse(scores: Vector, best: Vector) -> bool:
+    """Return whether scores of segments are above the best by no more than one standard error of the difference."""
+    with np.errstate(invalid="ignore"):
+        more = scores - best
+        return bool(more.mean() <= more.std(ddof=1) / math.sqrt(more.size))
 
 
 def _motion(recording: Recording) -> list[float]:
@@ -308,15 +315,15 @@ class _Motions:
                 found.append(np.asarray(model.simulate(self.recording))[:, :outputs])
         return np.array(found)
 
-    def score(self, Y: np.ndarray) -> float:
-        """Return the continuous ranked probability score of the draws, relative to the motion of each segment."""
+    def scores(self, Y: np.ndarray) -> Vector:
+        """Return the continuous ranked probability score of the draws in each segment, relative to its motion."""
         weight = 1.0 / np.maximum(self.motion, 0.05 * self.motion.max())[self.groups][:, None]
         half = len(Y) // 2
         with np.errstate(all="ignore"):
             away, apart = np.abs(Y - self.outputs), np.abs(Y[:half] - Y[half : 2 * half])
             each = (away.mean(axis=0) - 0.5 * apart.mean(axis=0)) * weight
-        value = float(each[self.groups >= 0].mean())
-        return value if math.isfinite(value) else math.inf
+        found = np.array([each[self.groups == k].mean() for k in range(len(self.motion))])
+        return np.where(np.isfinite(found), found, math.inf)
 
     def disturbance(self, Y: np.ndarray) -> tuple[Vector, float]:
         """Return share (outputs,) and colour of what the nearest draw of each segment leaves over."""
