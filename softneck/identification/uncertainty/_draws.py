@@ -182,8 +182,9 @@ def make_draws(
     Models are fitted to the first three quarters of each run: for robots that tendons bend the grey box without and
     with its optional parts, else kind `play`. The model is the one that predicts the last quarters best, by the
     continuous ranked probability score (Gneiting and Raftery 2007, J. Am. Stat. Assoc. 102:359); the factor on the
-    deviations of its numbers is the smallest within one standard error of the best (Breiman et al. 1984, sec. 3.4). What the nearest draw leaves over there, less the sensor's noise, is the disturbance; it is raised
-    until the band covers `LEVEL` of the samples at every amplitude.
+    deviations of its numbers is the smallest within one standard error of the best (Breiman et al. 1984, sec. 3.4).
+    What the nearest draw leaves over there, less the sensor's noise, is the disturbance; it is raised until the band
+    covers `LEVEL` of the samples at every amplitude.
 
     Args:
         recordings: of one robot and sample time, the payload as a channel.
