@@ -24,12 +24,12 @@ from softneck.core import (
     require_file,
     settings_text,
 )
-from softneck.robot import Robot
+from softneck.robot import Robot, Scaling
 
 from .._import import is_terminal
 from ..shared._console import note, percent, print_json, print_table
 from ..shared._options import columns_options, common_options
-from ._plan import BEST, CERTIFICATE, PI, STAGES, TUNER, Options, Step, linear_model, nonlinear_model, steps
+from ._plan import BEST, CERTIFICATE, FAMILY, PI, STAGES, TUNER, Options, Step, linear_model, nonlinear_model, steps
 from ._possible import backend, has_pytest, require_disk
 from ._project_run import FILE, ProjectRun
 
@@ -47,6 +47,12 @@ _OWN_REQUIREMENTS = (
 _SECOND_VISIT = (
     "to accept that: --requirements {folder}/tune/requirements.toml; to have more: record another motion (`softneck "
     "record mixed`, `softneck drives record mixed`) and start with both logs, as more motions leave fewer models"
+)
+# Set-points around this common position [rad of a neck] pull the tendons of `spring` and `column` taut.
+_COMMON_RAD = 1.0
+_TAUT = (
+    "no recording pulls the tendons together, and slack ones answer late: record `softneck record mixed "
+    "--cocontraction {common:g}`, and start with that log"
 )
 _WITHOUT = re.compile(r"Leave (\w+(?:, \w+)*) out of `outputs\.names` in a robot\.toml")
 # Sentences end where the next begins with a capital; `0.5 %.` within one does not.
@@ -101,6 +107,8 @@ def command(
         except SoftneckError as error:
             raise _with_advice(error, run, folder, paths) from error
         facts = {**_facts(run, folder), "not_run": not_run}
+        if "tune" in facts["failed"] and _never_taut():
+            note(_TAUT.format(common=_COMMON_RAD * Scaling.of(Robot.read("robot.toml")).motor_unit))
     _tell(facts, as_json=as_json)
 
 
@@ -272,6 +280,18 @@ def _decision(models: Sequence[dict[str, Any]]) -> str:
     found = [path for path in (Path(_CERTIFICATE_FILE), Path(CERTIFICATE)) if path.is_file()]
     read = [certificate_values(path.as_posix(), json.loads(settings_text(path, MOST_JSON))) for path in found]
     return project_decision(models, read, tuner=TUNER if Path(TUNER).is_file() else None)
+
+
+def _never_taut() -> bool:
+    """Return whether the family's recordings of a robot with tendons have no co-contraction."""
+    family = load(FAMILY, role="family") if Path(FAMILY).is_file() else None
+    found = [] if family is None else family.findings.get("tested", {}).get("conditions", [])
+    if family is None or not found or family.robot.tendon_angles is None:
+        return False
+    if not family.robot.redefinition()[1][:, -1].any():
+        return False  # a single tendon has none to pull against
+    middles = [sum(part["cocontraction"]) / 2.0 for part in found]
+    return max(middles) < 0.1 * _COMMON_RAD * Scaling.of(family.robot).motor_unit
 
 
 def _certified() -> dict[str, Any]:

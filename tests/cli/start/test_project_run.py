@@ -11,13 +11,15 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
 import pytest
 
-from softneck.cli.start import _project_run
+from softneck.cli.start import _project_run, _start
 from softneck.core import CheckFailedError
+from softneck.robot import Robot
 
 from ...data import neck_recording
 from ..conftest import Call
@@ -415,3 +417,22 @@ def test_a_long_refusal_is_noted_whole_and_ends_in_a_short_line(
         assert whole.partition(": ")[2].partition(". ")[0] in noted
     else:
         assert whole in noted
+
+
+@pytest.mark.parametrize(
+    ("robot", "middles", "never"),
+    [("neck", [(-0.01, 0.02)], True), ("neck", [(-0.01, 0.02), (0.9, 1.1)], False), ("neck", [], False),
+     ("arm", [(0.0, 0.0)], True), ("finger", [(0.0, 0.0)], False)],
+)  # fmt: skip
+def test_tendons_that_no_recording_pulls_together_are_known(
+    robot: str, middles: list, never: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    family = SimpleNamespace(
+        robot=Robot.preset(robot), findings={"tested": {"conditions": [{"cocontraction": pair} for pair in middles]}}
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(_start, "load", lambda _path, role: {"family": family}[role])
+    assert not _start._never_taut()  # there is no family
+    Path("models").mkdir()
+    Path(_start.FAMILY).touch()
+    assert _start._never_taut() is never
