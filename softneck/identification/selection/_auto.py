@@ -419,10 +419,10 @@ class _Race:
             if one.model is None:
                 raise DataError(one.failure)
             model = _settings(kind, self.seed, {}).fit(self.train)
-            if kind == "greybox":
-                again = as_found(_settings(kind, self.seed, _SCREENED[kind]), model)
-                self.short[kind] = again.fit(self.folds[0].train)
             if self.folds[0].judged:
+                if kind == "greybox":
+                    again = as_found(_settings(kind, self.seed, _SCREENED[kind]), model)
+                    self.short[kind] = again.fit(self.folds[0].train)
                 model = calibrate_validity(model, self.short[kind], *unseen_rows(self.folds[0]))
             judged = self._validate(kind, model)
             fits, error = all_rows(HOLD_OUT, self.hold_out).fits(model)

@@ -420,19 +420,26 @@ def test_a_long_refusal_is_noted_whole_and_ends_in_a_short_line(
 
 
 @pytest.mark.parametrize(
-    ("robot", "middles", "never"),
-    [("neck", [(-0.01, 0.02)], True), ("neck", [(-0.01, 0.02), (0.9, 1.1)], False), ("neck", [], False),
-     ("arm", [(0.0, 0.0)], True), ("finger", [(0.0, 0.0)], False)],
+    ("robot", "middles", "told"),
+    [("neck", [(-0.01, 0.02)], "by 0.005 rad"), ("neck", [(-0.01, 0.02), (0.9, 1.1)], "by 1 rad"),
+     ("neck", [(1.4, 1.6), (0.0, 0.0)], ""), ("neck", [], ""), ("arm", [(0.0, 0.0)], "by 0 rad"),
+     ("finger", [(0.0, 0.0)], "")],
 )  # fmt: skip
-def test_tendons_that_no_recording_pulls_together_are_known(
-    robot: str, middles: list, never: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tendons_that_no_recording_pulls_far_enough_together_are_told(
+    robot: str, middles: list, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
     family = SimpleNamespace(
         robot=Robot.preset(robot), findings={"tested": {"conditions": [{"cocontraction": pair} for pair in middles]}}
     )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(_start, "load", lambda _path, role: {"family": family}[role])
-    assert not _start._never_taut()  # there is no family
+    _start._advise_tautness()  # there is no family
+    assert not capsys.readouterr().err
     Path("models").mkdir()
     Path(_start.FAMILY).touch()
-    assert _start._never_taut() is never
+    _start._advise_tautness()
+    said = capsys.readouterr().err
+    assert bool(said) == bool(told)
+    assert told in said
+    assert not said or "mixed --cocontraction" in " ".join(said.split())
