@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 
 import numpy as np
@@ -44,6 +44,7 @@ class Motors:
     rest: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
+        _keep_tuples(self)
         _check_names("motors", self.names, MOST_MOTORS)
         _unit("motors.unit", self.unit)
         if not self.sign:
@@ -86,6 +87,7 @@ class Outputs:
     rest: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
+        _keep_tuples(self)
         _check_names("outputs", self.names, MOST_OUTPUTS)
         for name in self.names:
             if _TAKEN.fullmatch(name):
@@ -105,6 +107,16 @@ class Outputs:
     def shown(self) -> str:
         """In which unit tools show outputs: `display_unit`; "" for deg, which is usual for angles."""
         return "" if self.display_unit == "deg" else self.display_unit
+
+
+def _keep_tuples(thing: Motors | Outputs | Directions) -> None:
+    """Replace lists and arrays by tuples: what is frozen is compared and kept by its content."""
+    for field in fields(thing):
+        value = getattr(thing, field.name)
+        if isinstance(value, list | np.ndarray):
+            rows = (row.tolist() if isinstance(row, np.ndarray | np.generic) else row for row in value)
+            kept = tuple(tuple(row) if isinstance(row, list) else row for row in rows)
+            object.__setattr__(thing, field.name, kept)
 
 
 @cache
@@ -208,6 +220,7 @@ class Directions:
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        _keep_tuples(self)
         require_one_of("directions.kind", self.kind, KINDS)
         for key, needed in (("angles_deg", "tendons"), ("matrix", "matrix")):
             given = bool(getattr(self, key))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import tomli_w
 from softneck.core import FileFormatError, Matrix, SettingsError
 from softneck.plant import NeckParameters
 from softneck.robot import Robot, find_robot
+from softneck.robot._channels import Directions
 from softneck.signals import SET_POINTS, redefinition_matrix
 
 PRESETS = {"neck": (3, 2), "arm": (3, 2), "antagonist": (2, 1), "finger": (1, 1), "trunk4": (4, 2)}
@@ -212,3 +214,18 @@ def test_angles_are_held_to_what_can_be_told_apart(tmp_path: Path) -> None:
     robot(0.1)
     with pytest.raises(SettingsError, match="cannot span"):
         robot(0.05)
+
+
+def test_lists_and_arrays_make_the_same_robot() -> None:
+    # Loops keep their wirings by the robot's content.
+    whole = Robot.preset("neck")
+    motors = replace(whole.motors, names=list(whole.motors.names))  # pyright: ignore[reportArgumentType]
+    outputs = replace(whole.outputs, names=list(whole.outputs.names))  # pyright: ignore[reportArgumentType]
+    same = replace(whole, motors=motors, outputs=outputs)
+    assert same == whole
+    assert hash(same) == hash(whole)
+    assert same.set_points == SET_POINTS
+    rows = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    made = [Directions(kind="matrix", matrix=matrix) for matrix in (rows, np.array(rows))]  # pyright: ignore[reportArgumentType]
+    assert made[0] == made[1]
+    assert hash(made[0]) == hash(made[1])

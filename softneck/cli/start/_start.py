@@ -287,8 +287,8 @@ def _advise_tautness() -> None:
     """Say what to record where tendons are not pulled together far enough to stay taut."""
     family = load(FAMILY, role="family") if Path(FAMILY).is_file() else None
     found = [] if family is None else family.findings.get("tested", {}).get("conditions", [])
-    if family is None or not found or family.robot.tendon_angles is None:
-        return
+    if family is None or not found or family.robot.tendon_angles is None or family.robot.motors.unit != "rad":
+        return  # `softneck record` turns motors
     if not family.robot.redefinition()[1][:, -1].any():
         return  # a single tendon has none to pull against
     most = max(sum(part["cocontraction"]) / 2.0 for part in found)

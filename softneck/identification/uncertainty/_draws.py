@@ -234,7 +234,8 @@ def _no_worse(scores: Vector, best: Vector) -> bool:
     """Return whether scores of segments are above the best by no more than one standard error of the difference."""
     with np.errstate(invalid="ignore"):
         more = scores - best
-        return bool(more.mean() <= more.std(ddof=1) / math.sqrt(more.size))
+        error = more.std(ddof=1) / math.sqrt(more.size) if more.size > 1 else 0.0
+        return bool(more.mean() <= error)
 
 
 def _motion(recording: Recording) -> list[float]:

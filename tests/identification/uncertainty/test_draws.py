@@ -69,6 +69,9 @@ def test_a_factor_is_as_good_as_the_best_within_one_standard_error() -> None:
     assert not _draws._no_worse(best + spread + 1.01 * error, best)
     assert not _draws._no_worse(best + 1e-9, best)  # worse in every segment alike
     assert not _draws._no_worse(np.full(4, np.inf), best)
+    # One segment has no standard error.
+    assert _draws._no_worse(best[:1], best[:1])
+    assert not _draws._no_worse(best[:1] + 1e-9, best[:1])
 
 
 def test_every_amplitude_is_covered_and_its_width_is_said(made: Callable[..., Draws]) -> None:
