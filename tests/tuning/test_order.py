@@ -666,6 +666,34 @@ def test_what_holds_goes_on_and_at_least_the_better_half(values: list[float], ke
     assert len(found) == kept
 
 
+def test_a_search_goes_on_from_the_moved_start_of_a_kind_and_from_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = searching("abc")
+    for space in search.spaces:
+        space.start = np.array([0.5, 0.4])  # pyright: ignore[reportAttributeAccessIssue]
+        space.dimensions = (0, 1)  # pyright: ignore[reportAttributeAccessIssue]
+    # Moved along one setting, moved along both, and left; one that cannot be designed is said and dropped.
+    moved = {"a": [0.5, 0.3], "b": [0.6, 0.5], "c": [0.5, 0.4]}
+    optimisers = {space.kind: _search._optimiser(space, 0, i) for i, space in enumerate(search.spaces)}
+    before = dict(optimisers)
+    monkeypatch.setattr(Search, "_candidate", lambda _, space, x: Candidate(space.kind, {}, np.array(x)))
+    monkeypatch.setattr(Search, "_judge", lambda *_: None)
+    monkeypatch.setattr(Search, "_drop_kinds", lambda _, alive: alive)
+
+    def move(_: Search, starts: Any, reserved: int) -> Any:
+        assert reserved == 3 + 3
+        error = {"b": "no margin"}
+        return {kind: Candidate(kind, {}, np.array(moved[kind]), error=error.get(kind, "")) for kind in starts}
+
+    monkeypatch.setattr(Search, "_move_starts", move)
+    left = search._judge_starts(LEVELS[:2], 3, optimisers)
+    assert ([space.kind for space in left], search.dropped) == (["a", "c"], {"b": "no margin"})
+    assert optimisers["c"] is before["c"]
+    for number, kind in enumerate("ab"):
+        same = _search._optimiser(search.spaces[number], 0, number, np.array(moved[kind]))
+        np.testing.assert_array_equal(optimisers[kind].mean, moved[kind])
+        np.testing.assert_array_equal(optimisers[kind].ask(), same.ask())
+
+
 @pytest.mark.parametrize("own", [True, False])
 @pytest.mark.parametrize("budget", [1, 5, 40])
 def test_a_search_judges_starts_generations_neighbours_and_finals_within_its_budget(

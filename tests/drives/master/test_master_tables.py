@@ -127,6 +127,7 @@ def test_phases_follow_each_other_as_the_table_says_and_in_no_other_way() -> Non
 
 def test_the_first_fault_is_told_a_stop_goes_over_a_retreat_and_nothing_clears_either() -> None:
     supervisor = Supervisor()
+    assert (supervisor.phase, supervisor.since, supervisor.fault, supervisor.rehome) == (Phase.IDLE, 0.0, None, False)
     supervisor.phase = Phase.RUNNING
     lost, stop = Event(1.0, "sensor_lost"), Event(1.1, "operator")
     assert supervisor.react(1.0, [lost]) == [lost]
