@@ -292,7 +292,9 @@ def test_a_margin_that_was_not_computed_does_not_hold(tested: bool, asked: bool)
     assert active_requirement([blind], bounds, tested=tested) == (None, None)
 
 
-@pytest.mark.parametrize(("asked", "judged"), [(0.0, None), (5.0, 20.0), (20.0, 20.0), (29.0, 20.0), (60.0, 60.0)])
+@pytest.mark.parametrize(
+    ("asked", "judged"), [(0.0, None), (0.01, 20.0), (5.0, 20.0), (20.0, 20.0), (29.0, 20.0), (60.0, 60.0)]
+)
 def test_each_condition_asked_is_judged_or_said(asked: float, judged: float | None) -> None:
     """Directions, sizes and payloads are loops of their own; a delay is whole samples, at least one."""
     table = {"track": {"delay_ms": asked}, "sim": {"payloads_kg": [0.0, 0.32], "orientations_deg": [0.0, 30.0, 90.0]}}

@@ -16,7 +16,7 @@ from softneck.core import DataError, certificate_contents, write_certificate
 from softneck.identification import Draws, Family
 from softneck.identification.uncertainty import _draws
 from softneck.loop import LoopResult
-from softneck.verification import _drawn, make_requirements, verify
+from softneck.verification import Requirement, _drawn, make_requirements, verify
 from softneck.verification._drawn import Drawn, _Margin, certified_content, draws_of, run_drawn
 from softneck.verification._experiments import Experiment, LoopUnderTest, crossing_values, crossings
 from softneck.verification._neck_loops import loops_under_test, make_simulation_model, rows_of
@@ -164,6 +164,10 @@ def test_the_margin_of_a_draw_is_the_strictest_that_is_required() -> None:
     assert required(**{"axes.gain_margin": {"max": 9.0}, "axes.delay_margin_ms": {"min": 40.0}}) == {
         "axes.delay_margin_ms": 40.0
     }
+    asked = make_requirements({"require": {"axes.gain_margin": {"min": 2.0}}})
+    for limits in ((3.0, 2.5), (2.5, 3.0)):
+        more = tuple(Requirement("axes.gain_margin", "min", limit, True) for limit in limits)
+        assert _drawn._required_margins(replace(asked, bounds=(*asked.bounds, *more)))["axes.gain_margin"] == 3.0
 
 
 @pytest.mark.parametrize(
@@ -472,7 +476,8 @@ def run_with(
     draws, told = told_draws(), list[float]()
     draws.for_certificate = lambda attempt: [attempt] * len(steps)
     draws.for_search = lambda count=9: [0] * min(count, len(steps))
-    asked = make_requirements({"sim": {"decides": True}, "require": {"sim.overshoot_pct": {"max": 10.0}}})
+    require = {"sim.overshoot_pct": {"max": 10.0}, "sim.rise_s": {"min": 0.1, "max": 0.4}, "sim.settling_s": False}
+    asked = make_requirements({"sim": {"decides": True}, "require": require})
     found = run_drawn("f", draws, pi().block(), asked, order="sequential", observer=None, attempt=2,
                       progress=lambda share, _: told.append(share), **more)  # fmt: skip
     return found, told
@@ -493,6 +498,10 @@ def test_a_draw_fails_by_its_steps_and_by_its_margins(
     names = [item["name"] for item in found.conditions["sim.overshoot_pct"]]
     assert names == [f"draw {k + 1} of f, 0 deg" for k in range(3)]
     assert told == sorted(told)
+    # Of two bounds each must hold; what nobody bounds fails nothing.
+    for rise in (0.05, 0.5, math.nan):
+        two = [{"sim.rise_s": rise if k == bad else 0.4, "sim.settling_s": math.inf} for k in range(3)]
+        assert run_with(monkeypatch, two, [[], [], []])[0].failed == found.failed
     margins = [[replace(margin(Case("gain_up"), 2.0, k == bad), number=k)] for k in range(3)]
     assert run_with(monkeypatch, [{}] * 3, margins)[0].failed == (() if bad is None else (bad,))
 

@@ -223,7 +223,7 @@ def response(size: float, lag: float, peak: float = 0.0) -> np.ndarray:
     return TEST.step * (y + 0.1 * size * (t >= 0.9))
 
 
-def stepped(monkeypatch: pytest.MonkeyPatch, members: list[np.ndarray], others: list[float]) -> _steps.Steps:
+def stepped(monkeypatch: pytest.MonkeyPatch, members: list[np.ndarray], others: list[Any]) -> _steps.Steps:
     """Return the steps of one plant whose axes respond as `members`, moving the other axis by `others`."""
     plants = nominal_plants([source_of_family(family(), "f")])[0].take(np.array([0]))
     runs = iter(zip(members, others, strict=True))
@@ -260,6 +260,22 @@ def test_the_worse_axis_of_a_step_counts_and_is_named(name: str, monkeypatch: py
             found = stepped(monkeypatch, members, [0.0, 0.0])
             assert found.metrics[name][0] == math.inf
             assert found.worse[name][0] == place
+
+
+@pytest.mark.parametrize(("row", "counts"), [(0, True), (HALF - 1, True), (HALF, False)])
+@pytest.mark.parametrize("size", [0.03, -0.03, math.nan, math.inf])
+def test_what_another_axis_does_counts_until_the_load_comes(
+    row: int, counts: bool, size: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = np.zeros((2 * HALF, 1))
+    other[row] = size
+    still, y = np.zeros_like(other), response(0.2, 0.06)
+    expected = 0.0 if not counts else abs(math.degrees(size)) if math.isfinite(size) else math.inf
+    for others in ([other, still], [still, other]):
+        found = stepped(monkeypatch, [y, y], others)
+        assert found.metrics["coupling_deg"][0] == pytest.approx(expected)
+        # What is no number makes the whole response none.
+        assert math.isfinite(found.metrics["rise_s"][0]) is (math.isfinite(size) or not counts)
 
 
 def test_each_metric_of_a_step_follows_its_own_row() -> None:
@@ -433,7 +449,9 @@ def test_margins_of_each_law_plant_and_search_stand_under_their_axis_and_under_a
         "mimo.disk_margin": np.array([0.5, 0.6, 0.7]),
     }
     plants = SimpleNamespace(axes=("pitch", "roll"))
-    rows = [[StructuredResult("pitch", np.array([1.0, 2.0]), np.array([0.3, 0.6]))]]
+    # Of two sources, the second of which has two boxes.
+    boxes = [StructuredResult("pitch", np.array([1.0, 2.0]), np.array(upper)) for upper in ([0.3, 0.6], [0.9, 0.2])]
+    rows = [boxes[:1], boxes]
     part: Any = SimpleNamespace(name="low", plants=plants, margins=margin_table, structured=rows,
                                 found=SimpleNamespace(radius=0.99))  # fmt: skip
     evidence: Any = SimpleNamespace(metrics={}, plants=[0, 1])
@@ -450,31 +468,69 @@ def test_margins_of_each_law_plant_and_search_stand_under_their_axis_and_under_a
         assert found["axes.gain_margin"].describe(4) == {"row": 1, "axis": "roll", "frozen_point": "low"}
         assert found["mimo.disk_margin"].describe(1) == {"row": 1, "axis": "both", "frozen_point": "low"}
         assert found["robust.mu"].describe(0)["frequency_rad_s"] == 2.0
-        assert found["robust.mu"].values.tolist() == [0.6]
+        assert found["robust.mu"].describe(2)["frequency_rad_s"] == 1.0
+        assert found["robust.mu"].values.tolist() == [0.6, 0.6, 0.9]
 
 
 def test_what_was_not_computed_is_said() -> None:
     def absent(
         *, laws: int = 1, observer: bool = False, generations: int = 5, payload: bool = False, name: str = ""
     ) -> Any:
-        part = SimpleNamespace(name=name)
-        evidence = Evidence(None, None, [part] * laws, SimpleNamespace(metrics={}), None, [])  # pyright: ignore[reportArgumentType]
+        parts: list[Any] = [SimpleNamespace(name=name) for _ in range(laws)]
+        evidence = Evidence(None, None, parts, SimpleNamespace(metrics={}), None, [])  # pyright: ignore[reportArgumentType]
         ports = (SimpleNamespace(name="payload"),) if payload else ()
         controller: Any = SimpleNamespace(why="it has no ss()", block=SimpleNamespace(inputs=ports))
         asked = make_requirements({"sampling": {"search_generations": generations}})
+        added.clear()
         _evidence._fill_metrics(evidence, controller, asked, observer=observer)
+        assert added == parts
         return {key: why for key, why in evidence.not_computed.items()
                 if key not in ("the band of the data", "margins by experiment")}  # fmt: skip
 
+    added: list[Any] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_evidence, "_add_linear_margins", lambda *_: None)
+        patch.setattr(_evidence, "_add_linear_margins", lambda _, part: added.append(part))
         assert absent() == {}
+        assert absent(laws=3) == {}
         assert absent(laws=0) == dict.fromkeys(("stability", "axes", "mimo", "robust"), "it has no ss()")
         assert set(absent(observer=True)) == {"observer in the linear checks"}
         assert set(absent(observer=True, laws=0)) == {"stability", "axes", "mimo", "robust"}
         assert set(absent(generations=0)) == {"stability.searched_radius"}
         assert set(absent(payload=True)) == {"steps of other payloads"}
         assert set(absent(name="low")) == {"stability between frozen points"}
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("drawn", [True, False])
+@pytest.mark.parametrize("sim", [{}, {"decides": True}, {"preset": "n.toml"}])
+def test_loops_decide_over_models_draws_and_what_is_asked_and_over_a_built_in_plant_for_nobody(
+    own: bool, drawn: bool, sim: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = Evidence(None, None, [], None, None, [])  # pyright: ignore[reportArgumentType]
+    ran: list[Any] = []
+    part = SimpleNamespace(values={"sim.rise_s": [0.4]})
+    monkeypatch.setattr(_evidence, "compute_once", lambda compute, *_: compute())
+    monkeypatch.setattr(_evidence, "_linear_evidence", lambda *_: whole)
+    monkeypatch.setattr(_evidence, "_simulated", lambda *_, **more: ran.append(more) or (["run"], ["crossing"]))
+    monkeypatch.setattr(_evidence, "why_no_virtual_plant", lambda *_: "")
+    monkeypatch.setattr(_evidence, "judged_elsewhere", lambda *_: {"payload 2 kg": "judged at 1 kg"})
+    monkeypatch.setattr(_evidence, "_fill_metrics", lambda *_: None)
+    monkeypatch.setattr(_evidence, "draws_of", lambda _: {"f": "draws", "g": "draws"} if drawn else {})
+    monkeypatch.setattr(_evidence, "run_drawn", lambda *_, **more: ran.append(more) or part)
+    monkeypatch.setattr(_evidence, "_add_drawn", lambda _, names: ran.append(names))
+    under: Any = SimpleNamespace(robot=Robot.preset(), order="sequential", block=None)
+    plants: Any = [SimpleNamespace(name="own", thing=1)] * own
+    found = _evidence.gather(under, [], make_requirements({"sim": sim}), observer=None, progress=lambda *_: None,
+                             families={}, own=plants, attempt=3)  # fmt: skip
+    assert found.foreign is not (own or drawn or bool(sim))
+    simulated = own or not drawn
+    assert (found.necks, found.crossings) == ((["run"], ["crossing"]) if simulated else ([], []))
+    # Every family's draws, at this attempt; all that they tell decides, and what was judged elsewhere is said.
+    assert found.drawn == [part] * (2 if drawn else 0)
+    assert [item["attempt"] for item in ran if "attempt" in item] == [3] * len(found.drawn)
+    assert ran[-1] == ({"sim.rise_s"} if drawn else set())
+    assert found.not_computed["payload 2 kg"] == "judged at 1 kg"
+    assert ("sim.slack_s" in found.not_computed) is drawn
 
 
 def test_further_values_of_a_metric_are_appended_each_with_its_own_facts() -> None:
@@ -683,6 +739,32 @@ def test_a_scan_begins_where_nothing_is_raised_and_ends_at_its_first_oscillation
     bound = 2.2 * unit if what == "delay" else 2.2
     assert crossing(99.0, bound) == math.inf
     assert max(tried) == bound
+
+
+@pytest.mark.parametrize("what", ["gain_up", "gain_down", "delay"])
+@pytest.mark.parametrize("coarse", [True, False])
+def test_a_scan_is_made_of_every_posture_and_step_and_ends_where_an_earlier_one_does(
+    what: str, coarse: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scans: list[tuple[tuple[float, ...], float, float]] = []
+    values = iter([8.0, 9.0, 3.0, math.inf, 5.0, 4.0])
+
+    def first(case: Any, floor: float, least: float, *_: Any) -> float:
+        scans.append((case.posture, case.amplitude, least))
+        return next(values)
+
+    monkeypatch.setattr(_experiments, "_first_crossing", first)
+    monkeypatch.setattr(_experiments.Experiment, "floor", lambda _: 0.0)
+    loop = _experiments.LoopUnderTest(name="p", plant=lambda: None, controller=CONTROLLER().block(), size=2.0)  # pyright: ignore[reportArgumentType]
+    found = _experiments._scan_group(loop, "both", what, coarse)
+    postures = loop.postures()[: 1 if coarse or what == "gain_down" else 3]
+    assert len(set(loop.postures())) == 3
+    assert [scan[:2] for scan in scans] == [
+        (tuple(2.0 * angle for angle in lean), kick) for lean in postures for kick in loop.kicks
+    ]
+    assert len(set(loop.kicks)) == 2
+    assert [scan[2] for scan in scans] == [math.inf, 8.0, 8.0, 3.0, 3.0, 3.0][: len(scans)]
+    assert [item.value for item in found] == [8.0, 9.0, 3.0, math.inf, 5.0, 4.0][: len(scans)]
 
 
 # -- margins ----------------------------------------------------------------------------------------------------------
