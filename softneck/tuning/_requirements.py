@@ -6,7 +6,7 @@ import math
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -51,8 +51,9 @@ class TuneRequirements:
 
     `certificate`: requirements of `verify`. `track`: settings of the additional loops. `bounds`: all requirements,
     those of `certificate` first, less the safety margins. `reserve`: metric -> safety margin of its limit, for the
-    difference between a robot and its models. `stated`: metrics and keys of [track] and [sim] that the user states.
-    `table`: a requirements file that gives `tune` and `verify` the same requirements.
+    difference between a robot and its models. `kept`: metric -> how far a search stays below its limit, for draws that
+    it does not see. `stated`: metrics and keys of [track] and [sim] that the user states. `table`: a requirements file
+    that gives `tune` and `verify` the same requirements.
     """
 
     certificate: Requirements
@@ -61,6 +62,7 @@ class TuneRequirements:
     reserve: Mapping[str, float]
     table: Mapping[str, Any]
     stated: frozenset[str] = frozenset()
+    kept: Mapping[str, float] = field(default_factory=dict)
 
     def robot_limit(self, metric: str) -> float | None:
         """Return the largest allowed value of a metric on the robot: the limit plus the safety margin."""
@@ -90,22 +92,23 @@ class TuneRequirements:
 
 def read_tune_requirements(
     path: str | Path | None = None, *, robot: Robot | None = None, scale: Scale | None = None, stepping: bool = True,
-    rise: float | None = None, payload: float | None = None,
+    drawn: bool = False, rise: float | None = None, payload: float | None = None,
 ) -> TuneRequirements:  # fmt: skip
     """Return the requirements of a file, with defaults for the rest.
 
     `path`: a requirements file, also one for `verify`. `robot`: of the controller; None: the neck. `scale`: of the
     defaults; None: from the robot alone. `stepping`: whether there are simulation models; else default `sim.*` limits
-    apply to the linear plants. `rise`: the default [s]; None: that of the paper's neck, by the robot's time constant.
-    `payload`: the heaviest recorded one [kg], to which defaults go; None: not known.
+    apply to the linear plants. `drawn`: whether draws of a family decide. `rise`: the default [s]; None: that of the
+    paper's neck, by the robot's time constant. `payload`: the heaviest recorded one [kg], to which defaults go; None:
+    not known.
     """
-    make = partial(make_tune_requirements, robot=robot, scale=scale, stepping=stepping, rise=rise, payload=payload)
-    return read_file(path, make)
+    told = {"robot": robot, "scale": scale, "stepping": stepping, "drawn": drawn, "rise": rise, "payload": payload}
+    return read_file(path, partial(make_tune_requirements, **told))
 
 
 def make_tune_requirements(
     table: Mapping[str, Any], *, robot: Robot | None = None, scale: Scale | None = None, stepping: bool = True,
-    rise: float | None = None, payload: float | None = None,
+    drawn: bool = False, rise: float | None = None, payload: float | None = None,
 ) -> TuneRequirements:  # fmt: skip
     """Return the requirements of a table like a requirements file, with defaults for the rest."""
     scale = scale or Scale.of(robot or Robot.preset())
@@ -120,6 +123,9 @@ def make_tune_requirements(
     if payload is not None:
         heavy = usual["sim"]["payloads_kg"]
         usual["sim"] = {**usual["sim"], "payloads_kg": sorted({min(kg, payload) for kg in heavy})}
+    kept = {}
+    if drawn and "reserve" not in table:  # draws differ from each other as a robot does from its models
+        kept, usual["reserve"] = usual["reserve"], {}
     if not stepping:
         usual = _for_linear(usual)
     merged = {
@@ -136,7 +142,7 @@ def make_tune_requirements(
     certificate = make_requirements(merged, scale=scale)
     return TuneRequirements(
         certificate=certificate, track=track, bounds=(*certificate.bounds, *extra), reserve=reserve,
-        table={"version": VERSION, **merged},
+        table={"version": VERSION, **merged}, kept=kept,
         stated=frozenset(metric for metric, entry in table.get("require", {}).items() if entry is not False)
         | frozenset(f"{name}.{key}" for name in ("track", "sim") for key in table.get(name, {})),
     )  # fmt: skip

@@ -169,7 +169,7 @@ class Search:
 
     def cost(self, item: Candidate) -> float:
         """Return the cost of a candidate."""
-        return item.cost(self.task.bounds, tested=self.task.tested)
+        return item.cost(self.task.aims, tested=self.task.tested)
 
     def _candidates_of(self, kind: str) -> list[Candidate]:
         return [item for item in self.candidates.values() if item.kind == kind]

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,15 @@ class Task:
         return tuple(
             item for item in self.asked.bounds
             if not self.drawn or item.asked or item.metric.startswith(kept) or not item.metric.startswith(linear)
+        )  # fmt: skip
+
+    @property
+    def aims(self) -> tuple[Requirement, ...]:
+        """Requirements of the search, less what it stays below them for draws that it does not see."""
+        kept = self.asked.kept
+        return tuple(
+            replace(item, limit=item.limit - kept[item.metric])
+            if item.bound == "max" and item.limit > kept.get(item.metric, math.inf) else item for item in self.bounds
         )  # fmt: skip
 
     @property

@@ -63,6 +63,8 @@ BUDGET = 160
 _SEARCHED_DRAWS = 2
 # Number of the best candidates that are verified until one holds.
 _MAX_VERIFICATIONS = 2
+# Number of all verifications: a family has draws for so many.
+_MAX_ATTEMPTS = 4
 _UNCERTIFIED_REASON = "beside recordings nothing is certified of it; name it in --kinds to search it all the same"
 # Smaller co-contractions, of a neck, set no rule.
 _MIN_COCONTRACTION_RAD = 0.05
@@ -222,7 +224,7 @@ def _read_requirements(requirements: Any, robot: Robot, linear: list[Any], *, st
     make = make_tune_requirements if isinstance(requirements, Mapping) else read_tune_requirements
     drawn = [thing.draws for thing in linear if getattr(thing, "draws", None) is not None]
     heaviest = min((max(draws.conditions["payload_kg"]) for draws in drawn), default=None)
-    read = partial(make, requirements, scale=scale, stepping=stepping, payload=heaviest)
+    read = partial(make, requirements, scale=scale, stepping=stepping, drawn=bool(drawn), payload=heaviest)
     return read(rise=default_rise(linear, read()))
 
 
@@ -250,14 +252,13 @@ def _target_rise(task: Task) -> float:
 def _make_result(search: Search, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
     """Verify the best candidate and return the result of a search."""
     task, ranked = search.task, search.sort_candidates()
-    eyes = task.observer
     if not ranked:
         why = "; ".join(f"{kind}: {text}" for kind, text in search.dropped.items())
         if any(space.kind not in search.dropped for space in search.spaces):
             raise CheckFailedError(f"the budget ended before any candidate was judged ({why}); increase it.")
         raise SettingsError(f"no candidate controller could be designed ({why}).")
     compared = [item for item in ranked if LEVELS.index(item.level) >= 1] or ranked
-    best, verification, controller = _verify_best(search, compared, files, progress)
+    best, verification, controller, tried = _verify_best(search, compared, files, progress)
     bounds = task.bounds
     names = objectives(compared)
     # Loops of tuning have noise and additional delay, those of `verify` do not.
@@ -272,40 +273,85 @@ def _make_result(search: Search, files: Mapping[str, tuple[str, str]] | None, pr
         stuck = known[0].requirement.metric
         nearest = known[0].value if len(verification.failed) == 1 else None
     found = Tuned(
-        best=best, controller=controller, observer=eyes,
-        assumed=dict(getattr(controller, "design", {}).get("assumed", {})),
-        own=prepare(task).own,
-        observed=make_observer(task, best.kind) is not None
-        or (eyes is not None and bool(task.own) and holds_with_observer(task, best, eyes, bounds)),
+        best=best, controller=controller, observer=task.observer,
+        assumed=_assumed(controller), own=prepare(task).own, observed=_observed(task, best),
         verification=verification, holds=holds,
         candidates=compared, front=front(compared, names), objectives=names, binding=stuck, nearest=nearest,
         evaluations=len(search.spent), dropped=search.dropped, task=task,
     )  # fmt: skip
-    return found if holds or not closed else _relax(found, files, progress)
+    return found if holds or not closed else _relax(found, tried, files, progress)
 
 
-def _relax(found: Tuned, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
-    """Return the result with defaults of speed and precision relaxed to those of the best, if all others hold.
+def _relax(found: Tuned, tried: int, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
+    """Return the result with defaults of speed and precision relaxed to those of a candidate, if all others hold.
 
-    Stated requirements and stability margins are not relaxed; the new requirements are verified again.
+    Candidates are the best, then the best of each other kind that the search has failed in nothing else. Stated
+    requirements and stability margins are not relaxed. Each verification has draws that none of the `tried` has seen.
     """
-    task, kept = found.task, relaxations(found.best, found.verification.failed, found.task.asked)
-    if not kept:
-        return found
-    asked = relax_limits(task.asked, {metric: one.limit for metric, one in kept.items()})
-    progress(0.9, "verify what holds")
-    # Its draws are none that an attempt of `_verify_best` has seen.
-    attempt = _MAX_VERIFICATIONS + 1
-    verification = _verify_candidate(replace(task, asked=asked), found.controller, found.best.kind, files, attempt)
-    if not verification.holds:
-        return found
-    return replace(found, task=replace(task, asked=asked), verification=verification, holds=True, loosened=kept)
+    task = found.task
+    ready = prepare(task)
+    for item in _relaxable(found):
+        controller, verification = found.controller, found.verification
+        if item is not found.best:
+            if tried + 2 > _MAX_ATTEMPTS:
+                break
+            tried += 1
+            progress(0.9, f"verify {item.kind}")
+            controller = design_candidate(task, ready, item.kind, item.settings)
+            verification = _verify_candidate(task, controller, item.kind, files, tried)
+        kept = relaxations(item, verification.failed, task.asked)
+        asked = task.asked
+        if kept:
+            tried += 1
+            progress(0.9, "verify what holds")
+            asked = relax_limits(asked, {metric: one.limit for metric, one in kept.items()})
+            verification = _verify_candidate(replace(task, asked=asked), controller, item.kind, files, tried)
+        elif item is found.best:
+            continue
+        if verification.holds:
+            return _with_best(found, item, controller, verification, replace(task, asked=asked), kept)
+    return found
+
+
+def _relaxable(found: Tuned) -> list[Candidate]:
+    """Return the best, and the best of each other kind that fails in its search by relaxable defaults alone."""
+    task, first = found.task, {found.best.kind: found.best}
+    for item in found.candidates:
+        broken = {name for name, value in item.ratios(task.bounds, tested=task.tested).items() if value > 1.0}
+        if not item.error and broken <= relaxations(item, (), task.asked).keys():
+            first.setdefault(item.kind, item)
+    return list(first.values())
+
+
+def _with_best(
+    found: Tuned, item: Candidate, controller: Any, verification: Verification, task: Task,
+    loosened: Mapping[str, Loosened],
+) -> Tuned:  # fmt: skip
+    """Return the result with this candidate as its best, which holds."""
+    own = item is found.best
+    return replace(
+        found, best=item, controller=controller, verification=verification, holds=True, task=task, loosened=loosened,
+        assumed=found.assumed if own else _assumed(controller),
+        observed=found.observed if own else _observed(task, item),
+    )  # fmt: skip
+
+
+def _assumed(controller: Any) -> dict[str, float]:
+    return dict(getattr(controller, "design", {}).get("assumed", {}))
+
+
+def _observed(task: Task, item: Candidate) -> bool:
+    """Return whether the steps meet their requirements with the observer of the task."""
+    eyes = task.observer
+    return make_observer(task, item.kind) is not None or (
+        eyes is not None and bool(task.own) and holds_with_observer(task, item, eyes, task.bounds)
+    )
 
 
 def _verify_best(
     search: Search, compared: Sequence[Candidate], files: Mapping[str, tuple[str, str]] | None, progress: Progress
-) -> tuple[Candidate, Verification, Any]:
-    """Return the first of the best whose certificate holds, else the best, with its verification."""
+) -> tuple[Candidate, Verification, Any, int]:
+    """Return the first of the best whose certificate holds, else the best, its verification, and how many were made."""
     task, found = search.task, []
     ready = prepare(task)
     promising = [item for item in compared if search.cost(item) <= 1.0][:_MAX_VERIFICATIONS] or compared[:1]
@@ -314,9 +360,9 @@ def _verify_best(
         progress(number / len(promising), f"verify {item.kind}")
         verification = _verify_candidate(task, controller, item.kind, files, number + 1)
         if verification.holds:
-            return item, verification, controller
+            return item, verification, controller, number + 1
         found.append((item, verification, controller))
-    return found[0]
+    return *found[0], len(promising)
 
 
 def _verify_candidate(

@@ -39,7 +39,7 @@ def judged(_: Any, kind: str, settings: Mapping[str, Any], level: str) -> Judgem
 def searched(monkeypatch: pytest.MonkeyPatch, budget: int, tested: bool = True) -> Search:
     monkeypatch.setattr(_search, "judge_candidate", judged)
     task: Any = SimpleNamespace(
-        asked=SimpleNamespace(bounds=BOUNDS), bounds=BOUNDS, own={"neck": 0}, seed=0, tested=tested,
+        asked=SimpleNamespace(bounds=BOUNDS), bounds=BOUNDS, aims=BOUNDS, own={"neck": 0}, seed=0, tested=tested,
     )  # fmt: skip
     each = spaces(("pi", "hinf"), rise=0.4, cocontraction=None, robot=Robot.preset())
     found = Search(task, each, WorkerPool(1, SameProcess()), Log(None, ""), budget, lambda *_: None)

@@ -27,6 +27,7 @@ from softneck.tuning._requirements import (
     make_tune_requirements,
     read_tune_requirements,
 )
+from softneck.tuning._tune import task_of
 from softneck.verification import make_requirements, read_requirements
 from softneck.verification._metrics import Scale
 
@@ -58,6 +59,23 @@ def test_a_reserve_is_taken_off_what_plants_must_keep_and_said() -> None:
     assert {"sim.rise_s <= 0.4 (0.5 less a reserve of 0.1)", "track.circle_rms_deg <= 3"} <= set(asked.lines())
     # What verify is asked is what the plants must keep.
     assert asked.certificate.bounds == tuple(b for b in asked.bounds if not b.metric.startswith("track."))
+
+
+def test_where_draws_decide_the_search_alone_stays_below_the_default_limit() -> None:
+    drawn, known = make_tune_requirements({}, drawn=True), make_tune_requirements({})
+    assert not drawn.reserve
+    assert drawn.kept == known.reserve
+    assert drawn.limit("sim.overshoot_pct") == known.robot_limit("sim.overshoot_pct")
+    task = task_of({"n": neck()}, {}, 0)
+    aims = {b.metric: b.limit for b in replace(task, asked=drawn).aims}
+    assert aims["sim.overshoot_pct"] == pytest.approx(known.limit("sim.overshoot_pct"))
+    assert {name for name, limit in aims.items() if limit != drawn.limit(name) and drawn.limit(name)} == set(drawn.kept)
+    assert replace(task, asked=known).aims == replace(task, asked=known).bounds
+    # A reserve of one's own is taken off all limits, as without draws; a limit below it is aimed at itself.
+    own = {"reserve": {"sim.overshoot_pct": 1.0}}
+    assert make_tune_requirements(own, drawn=True).bounds == make_tune_requirements(own).bounds
+    tight = make_tune_requirements({"require": {"sim.overshoot_pct": {"max": 1.0}}}, drawn=True)
+    assert {b.limit for b in replace(task, asked=tight).aims if b.metric == "sim.overshoot_pct"} == {1.0}
 
 
 def test_nothing_is_kept_back_of_what_is_not_asked() -> None:
