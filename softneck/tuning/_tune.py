@@ -258,7 +258,8 @@ def _make_result(search: Search, files: Mapping[str, tuple[str, str]] | None, pr
             raise CheckFailedError(f"the budget ended before any candidate was judged ({why}); increase it.")
         raise SettingsError(f"no candidate controller could be designed ({why}).")
     compared = [item for item in ranked if LEVELS.index(item.level) >= 1] or ranked
-    best, verification, controller, tried = _verify_best(search, compared, files, progress)
+    certified, tried = _verify_best(search, compared, files, progress)
+    best, verification = certified.item, certified.verification
     bounds = task.bounds
     names = objectives(compared)
     # Loops of tuning have noise and additional delay, those of `verify` do not.
@@ -273,9 +274,8 @@ def _make_result(search: Search, files: Mapping[str, tuple[str, str]] | None, pr
         stuck = known[0].requirement.metric
         nearest = known[0].value if len(verification.failed) == 1 else None
     found = Tuned(
-        best=best, controller=controller, observer=task.observer,
-        assumed=_assumed(controller), own=prepare(task).own, observed=_observed(task, best),
-        verification=verification, holds=holds,
+        best=best, controller=certified.controller, observer=task.observer, observed=certified.observed,
+        assumed=_assumed(certified.controller), own=prepare(task).own, verification=verification, holds=holds,
         candidates=compared, front=front(compared, names), objectives=names, binding=stuck, nearest=nearest,
         evaluations=len(search.spent), dropped=search.dropped, task=task,
     )  # fmt: skip
@@ -289,27 +289,30 @@ def _relax(found: Tuned, tried: int, files: Mapping[str, tuple[str, str]] | None
     requirements and stability margins are not relaxed. Each verification has draws that none of the `tried` has seen.
     """
     task = found.task
-    ready = prepare(task)
+    best = _Certified(found.best, found.controller, found.observed, found.verification)
     for item in _relaxable(found):
-        controller, verification = found.controller, found.verification
+        certified = best
         if item is not found.best:
             if tried + 2 > _MAX_ATTEMPTS:
                 break
             tried += 1
             progress(0.9, f"verify {item.kind}")
-            controller = design_candidate(task, ready, item.kind, item.settings)
-            verification = _verify_candidate(task, controller, item.kind, files, tried)
-        kept = relaxations(item, verification.failed, task.asked)
+            certified = _certify(task, item, files, tried)
+        kept = relaxations(item, certified.verification.failed, task.asked)
         asked = task.asked
         if kept:
             tried += 1
             progress(0.9, "verify what holds")
             asked = relax_limits(asked, {metric: one.limit for metric, one in kept.items()})
-            verification = _verify_candidate(replace(task, asked=asked), controller, item.kind, files, tried)
+            certified = _certify_again(replace(task, asked=asked), certified, files, tried)
         elif item is found.best:
             continue
-        if verification.holds:
-            return _with_best(found, item, controller, verification, replace(task, asked=asked), kept)
+        if certified.verification.holds:
+            return replace(
+                found, best=item, controller=certified.controller, observed=certified.observed, loosened=kept,
+                assumed=_assumed(certified.controller), verification=certified.verification, holds=True,
+                task=replace(task, asked=asked),
+            )  # fmt: skip
     return found
 
 
@@ -321,19 +324,6 @@ def _relaxable(found: Tuned) -> list[Candidate]:
         if not item.error and broken <= relaxations(item, (), task.asked).keys():
             first.setdefault(item.kind, item)
     return list(first.values())
-
-
-def _with_best(
-    found: Tuned, item: Candidate, controller: Any, verification: Verification, task: Task,
-    loosened: Mapping[str, Loosened],
-) -> Tuned:  # fmt: skip
-    """Return the result with this candidate as its best, which holds."""
-    own = item is found.best
-    return replace(
-        found, best=item, controller=controller, verification=verification, holds=True, task=task, loosened=loosened,
-        assumed=found.assumed if own else _assumed(controller),
-        observed=found.observed if own else _observed(task, item),
-    )  # fmt: skip
 
 
 def _assumed(controller: Any) -> dict[str, float]:
@@ -348,31 +338,52 @@ def _observed(task: Task, item: Candidate) -> bool:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class _Certified:
+    """A candidate with its controller, whether its loop has the observer, and the verification of that loop."""
+
+    item: Candidate
+    controller: Any
+    observed: bool
+    verification: Verification
+
+
 def _verify_best(
     search: Search, compared: Sequence[Candidate], files: Mapping[str, tuple[str, str]] | None, progress: Progress
-) -> tuple[Candidate, Verification, Any, int]:
-    """Return the first of the best whose certificate holds, else the best, its verification, and how many were made."""
-    task, found = search.task, []
-    ready = prepare(task)
+) -> tuple[_Certified, int]:
+    """Return the first of the best whose certificate holds, else the best, and the number of verifications."""
+    found: list[_Certified] = []
     promising = [item for item in compared if search.cost(item) <= 1.0][:_MAX_VERIFICATIONS] or compared[:1]
     for number, item in enumerate(promising):
-        controller = design_candidate(task, ready, item.kind, item.settings)
         progress(number / len(promising), f"verify {item.kind}")
-        verification = _verify_candidate(task, controller, item.kind, files, number + 1)
-        if verification.holds:
-            return item, verification, controller, number + 1
-        found.append((item, verification, controller))
-    return *found[0], len(promising)
+        found.append(_certify(search.task, item, files, number + 1))
+        if found[-1].verification.holds:
+            return found[-1], number + 1
+    return found[0], len(promising)
 
 
-def _verify_candidate(
-    task: Task, controller: Any, kind: str, files: Mapping[str, tuple[str, str]] | None, attempt: int
+def _certify(task: Task, item: Candidate, files: Mapping[str, tuple[str, str]] | None, attempt: int) -> _Certified:
+    """Return the verification of a candidate's loop, with the observer where its steps hold with it."""
+    controller = design_candidate(task, prepare(task), item.kind, item.settings)
+    observed = _observed(task, item)
+    return _Certified(item, controller, observed, _verify_loop(task, controller, observed, files, attempt))
+
+
+def _certify_again(
+    task: Task, made: _Certified, files: Mapping[str, tuple[str, str]] | None, attempt: int
+) -> _Certified:
+    """Return the same loop, verified with the requirements of this task."""
+    return replace(made, verification=_verify_loop(task, made.controller, made.observed, files, attempt))
+
+
+def _verify_loop(
+    task: Task, controller: Any, observed: bool, files: Mapping[str, tuple[str, str]] | None, attempt: int
 ) -> Verification:
-    observer = task.observer if make_observer(task, kind) is not None else None
     plants = {**task.linear, **{name: thing for name, thing in task.own.items() if name not in task.drawn}}
     return verify(
-        controller, plants, task.asked.certificate, files=files, progress=silent, observer=observer, attempt=attempt
-    )
+        controller, plants, task.asked.certificate, files=files, progress=silent, attempt=attempt,
+        observer=task.observer if observed else None,
+    )  # fmt: skip
 
 
 def _observer(task: Task) -> Any:

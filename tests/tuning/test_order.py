@@ -790,27 +790,43 @@ def test_the_first_whose_certificate_holds_is_taken_and_else_the_best(
     items = [of_kind("a", 0.1 * (k + 1), number=k) for k in range(len(holds))] + [of_kind("a", 5.0)]
     tried: list[int] = []
 
-    def verified(task: Any, controller: Any, kind: str, files: Any, attempt: int) -> Any:
+    def verified(task: Any, controller: Any, observed: bool, files: Any, attempt: int) -> Any:
+        assert observed is (controller == 0.2)
         tried.append(attempt)
         return SimpleNamespace(holds=holds[attempt - 1], number=attempt - 1)
 
     monkeypatch.setattr(_tune, "prepare", lambda _: None)
-    monkeypatch.setattr(_tune, "design_candidate", lambda *_: None)
-    monkeypatch.setattr(_tune, "_verify_candidate", verified)
+    monkeypatch.setattr(_tune, "design_candidate", lambda *settings: settings[-1]["k"])
+    # What is verified is the loop that is delivered: with the observer where its steps hold with it.
+    monkeypatch.setattr(_tune, "_observed", lambda _, item: item.settings["k"] == 0.2)
+    monkeypatch.setattr(_tune, "_verify_loop", verified)
+    items = [replace(item, settings={"k": round(0.1 * (k + 1), 1)}) for k, item in enumerate(items)]
     search = searching()
     most = _tune._MAX_VERIFICATIONS
-    verification: Any
-    best, verification, _, count = _tune._verify_best(search, items, None, lambda *_: None)
+    found, count = _tune._verify_best(search, items, None, lambda *_: None)
+    verification: Any = found.verification
     first = next((k for k, held in enumerate(holds[:most]) if held), None)
-    assert best is items[first or 0]
+    assert found.item is items[first or 0]
+    assert (found.controller, found.observed) == (found.item.settings["k"], found.controller == 0.2)
     assert verification.number == (first or 0)
     # Each attempt at a certificate has a number of its own: its draws are none that another has seen.
     assert tried == list(range(1, (min(len(holds), most) if first is None else first + 1) + 1))
     assert count == len(tried)
     # If none holds in the search, the best alone is verified.
     tried.clear()
-    assert _tune._verify_best(search, items[-1:] * 2, None, lambda *_: None)[0] is items[-1]
+    assert _tune._verify_best(search, items[-1:] * 2, None, lambda *_: None)[0].item is items[-1]
     assert tried == [1]
+
+
+@pytest.mark.parametrize("observed", [True, False])
+def test_a_certificate_is_of_the_loop_that_is_delivered_without_the_draws_of_the_search(
+    observed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = task_for({}, linear={"f": 1}, own={"p": 2, "f, draw 1": 3}, drawn=("f, draw 1",), observer="eyes")
+    monkeypatch.setattr(_tune, "verify", lambda *settings, **named: (*settings, named))
+    controller, plants, asked, named = _tune._verify_loop(task, "c", observed, None, 2)  # pyright: ignore[reportGeneralTypeIssues]
+    assert (controller, plants, asked) == ("c", {"f": 1, "p": 2}, task.asked.certificate)
+    assert (named["observer"], named["attempt"]) == ("eyes" if observed else None, 2)
 
 
 def ended(
@@ -822,7 +838,8 @@ def ended(
     best = Candidate("pi", {}, np.zeros(1), level, {"sim.rise_s": m, "axes.sensitivity": 1.0})
     failed = [SimpleNamespace(value=value, requirement=bounds[0]) for holds, value in verified if not holds]
     verification = SimpleNamespace(holds=not failed, failed=failed)
-    monkeypatch.setattr(_tune, "_verify_best", lambda *_: (best, verification, SimpleNamespace(design={}), 1))
+    certified = _tune._Certified(best, SimpleNamespace(design={}), False, verification)  # pyright: ignore[reportArgumentType]
+    monkeypatch.setattr(_tune, "_verify_best", lambda *_: (certified, 1))
     monkeypatch.setattr(_tune, "prepare", lambda _: SimpleNamespace(own=()))
     monkeypatch.setattr(_tune, "make_observer", lambda *_: None)
     monkeypatch.setattr(_tune, "_relax", lambda found, *_: ("relaxed", found))
@@ -889,22 +906,24 @@ def relaxed(monkeypatch: pytest.MonkeyPatch, items: list[Candidate], held: dict[
     task = replace(task_of({"n": linear_neck()}, {}, 0), asked=asked)
     made: list[tuple[str, bool, int]] = []
 
-    def verified(task: Any, _: Any, kind: str, __: Any, attempt: int) -> Any:
+    def verified(task: Any, controller: Any, observed: bool, __: Any, attempt: int) -> Any:
+        assert observed is (controller.kind == "lqg")
         wider = task.asked.limit("sim.rise_s") == 0.7
-        made.append((kind, wider, attempt))
-        return SimpleNamespace(holds=held.get((kind, wider), False), failed=[kind], task=task)
+        made.append((controller.kind, wider, attempt))
+        return SimpleNamespace(holds=held.get((controller.kind, wider), False), failed=[controller.kind], task=task)
 
     def kept(item: Candidate, failed: Any, _: Any) -> Any:
         return {} if item.settings.get("margins") and failed else RELAXED
 
     monkeypatch.setattr(_tune, "relaxations", kept)
-    monkeypatch.setattr(_tune, "_verify_candidate", verified)
+    monkeypatch.setattr(_tune, "_verify_loop", verified)
     monkeypatch.setattr(_tune, "design_candidate", lambda *settings: SimpleNamespace(kind=settings[2], design={}))
     monkeypatch.setattr(_tune, "prepare", lambda _: None)
-    monkeypatch.setattr(_tune, "make_observer", lambda *_: True)
+    monkeypatch.setattr(_tune, "_observed", lambda _, item: item.kind == "lqg")
+    controller = SimpleNamespace(kind=items[0].kind, design={})
     # That of the best may hold where the loops of its search do not.
     first = SimpleNamespace(failed=[items[0].kind], holds=True)
-    found: Any = _Found(task, items[0], first, candidates=tuple(items))
+    found: Any = _Found(task, items[0], first, candidates=tuple(items), controller=controller)
     again: Any = _tune._relax(found, tried, None, lambda *_: None)
     assert again.holds is any(held.get((kind, wide)) for kind, wide, _ in made)
     if not again.holds:
@@ -934,7 +953,7 @@ def test_where_the_best_fails_in_more_the_best_of_another_kind_is_verified_and_r
     found, made = relaxed(monkeypatch, items, {("lqg", True): True}, 1)
     # At what was asked first, which tells each metric that fails; never more certificates than a family has draws for.
     assert made == [("lqg", False, 2), ("lqg", True, 3)]
-    assert (found.best, found.controller.kind) == (items[2], "lqg")
+    assert (found.best, found.controller.kind, found.observed) == (items[2], "lqg", True)
     assert relaxed(monkeypatch, items, {}, 1)[1] == [("lqg", False, 2), ("lqg", True, 3)]
     assert relaxed(monkeypatch, items, {}, 3)[1] == []
     # One that fails in its margins in the search is left out.
