@@ -98,7 +98,7 @@ def command(
         )
     folder = path.with_name(f"{path.name.removesuffix('.json').removesuffix('.certificate')}_worst")
     loops = found.write_worst(folder, controller=controller, observer=observer, force=True)
-    counted = {"plants": families, "tried": [*earlier, this]} if found.evidence.drawn else None
+    counted = {"attempts": {"plants": families, "tried": [*earlier, this]}} if found.evidence.drawn else None
     contents = found.contents(loops, counted)
     write_certificate(path, contents, force=replace)
     if html is not None:

@@ -60,7 +60,7 @@ def write_tuned(found: Tuned, folder: Path, plants: Mapping[str, Path]) -> dict[
     certificate = folder / CERTIFICATE
     if found.holds:  # includes [track], which `verify` does not check
         more = {"loosened": _loosened_values(found), "judged_elsewhere": found.judged_elsewhere()}
-        write_certificate(certificate, {**verification.contents(), **more}, force=True)
+        write_certificate(certificate, verification.contents(further=more), force=True)
     else:
         certificate.unlink(missing_ok=True)
     _write_loop(found, folder, steps)

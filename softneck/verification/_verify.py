@@ -115,11 +115,11 @@ class Verification(ReprMixin):
         )
 
     def contents(
-        self, loops: Mapping[int, Path] | None = None, attempts: Mapping[str, Any] | None = None
+        self, loops: Mapping[int, Path] | None = None, further: Mapping[str, Any] | None = None
     ) -> dict[str, Any]:
-        """Return the certificate's JSON values.
+        """Return the certificate's JSON values, under its seal.
 
-        `loops` maps a verdict's number to the loop file of its worst plant; `attempts` are those made so far.
+        `loops` maps a verdict's number to the loop file of its worst plant; `further` are entries of the command.
         """
         rows = []
         for number, verdict in enumerate(self.verdicts):
@@ -153,12 +153,12 @@ class Verification(ReprMixin):
             "draws": [part.facts() for part in evidence.drawn],
             "settings": {name: self.requirements.table(name) for name in ("uncertainty", "sampling", "step", "sim")},
         }
-        if attempts is not None:
-            more["attempts"] = dict(attempts)
         if robot.in_header():
             more["robot"] = {"name": robot.name, "hash": robot.hash}
             more["scale"] = {"time": scale.time, "size": scale.size}
-        return certificate_contents("verify", holds=self.holds, files=self.files, more=to_json(more))
+        return certificate_contents(
+            "verify", holds=self.holds, files=self.files, more=to_json(more | dict(further or {}))
+        )
 
     def write_worst(
         self, folder: str | Path, *, controller: str | Path, observer: str | Path | None = None, force: bool = False

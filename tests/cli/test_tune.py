@@ -10,6 +10,7 @@ import pytest
 import softneck
 from softneck.cli._main import run
 from softneck.cli._tune import way_on
+from softneck.core import read_certificate
 from softneck.estimation import KalmanSettings
 
 from ..data import ROOT
@@ -67,7 +68,7 @@ def test_the_folder_holds_what_belongs_to_the_best(
     # What the certificate says `verify` says too, with the requirements that are left there.
     asked = ["--requirements", str(folder / "requirements.toml")]
     assert run(["verify", str(folder / "best.npz"), str(MODEL), *asked, "--json", "-o", str(tmp_path / "c.json")]) == 0
-    again, mine = json.loads(capsys.readouterr().out), json.loads((folder / "best.certificate.json").read_text())
+    again, mine = json.loads(capsys.readouterr().out), read_certificate(folder / "best.certificate.json").contents
     assert [(r["metric"], r["value"], r["holds"]) for r in again["requirements"]] == [
         (r["metric"], r["value"], r["holds"]) for r in mine["requirements"]
     ]

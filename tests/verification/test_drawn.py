@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softneck.cli._verify import _attempt_of, _tried
+from softneck.cli._verify import _attempt_of, _attempt_of_tune, _tried
 from softneck.core import DataError, certificate_contents, write_certificate
 from softneck.identification import Draws, Family
 from softneck.identification.uncertainty import _draws
@@ -125,6 +125,16 @@ def test_attempts_over_a_family_are_counted_from_the_certificates_of_a_folder(tm
     assert attempt("d" * 64, "f" * 64, "two")[0] == 4
     (tmp_path / "note.json").write_text("{}", encoding="utf-8")
     assert attempt("d" * 64, "f" * 64, "two")[0] == 4
+
+
+def test_the_attempt_that_tune_certified_counts_for_its_controller(tmp_path: Path) -> None:
+    said = {"requirements": [], "draws": [{"attempt": 1}, {"attempt": 3}]}
+    files = {"controller": ("best.npz", "a" * 64)}
+    write_certificate(
+        tmp_path / "best.certificate.json", certificate_contents("verify", holds=True, files=files, more=said)
+    )
+    assert _attempt_of_tune(tmp_path / "best.npz") == 3
+    assert _attempt_of_tune(tmp_path / "other.npz") == 1
 
 
 # -- how draws are run and judged, without a loop ---------------------------------------------------------------------

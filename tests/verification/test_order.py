@@ -172,7 +172,7 @@ def test_a_verification_holds_where_none_fails_and_counts_what_is_not_computed(h
     assert (said["plants"]["count"], said["extra_delay_samples"], said["not_computed"]) == (7, 2, {"sim": "none"})
     assert said["files"] == {"controller": {"path": "pi.npz", "sha256": "a" * 64}}
     assert "attempts" not in said
-    assert found.contents(attempts={"tried": []})["attempts"] == {"tried": []}
+    assert found.contents(further={"attempts": {"tried": []}})["attempts"] == {"tried": []}
     assert {"robot", "scale"}.isdisjoint(said)
     # Of another robot it says whose, and by what the defaults were stretched.
     other = Robot.preset("antagonist")
