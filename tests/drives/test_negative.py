@@ -595,6 +595,24 @@ def test_a_certificate_of_another_robot_is_refused() -> None:
             _certified._require_robot(of({"robot": robot}), NECK)
 
 
+@pytest.mark.parametrize("other", [None, "verify", "simulate"])
+def test_both_certificates_must_be_of_the_robot_that_the_drives_move(
+    other: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def covering(kind: str, *_: Any) -> Any:
+        contents: dict[str, Any] = {"duration_s": 5.0, "robot": {"hash": "0" * 64 if kind == other else NECK.hash}}
+        return SimpleNamespace(path=f"{kind}.json", contents=contents)
+
+    monkeypatch.setattr(_certified, "_covering", covering)
+    monkeypatch.setattr(_certified, "_require_minimum", lambda *_: None)
+    loop = SimpleNamespace(duration=5.0, controller=SimpleNamespace(sample_time=0.02))
+    setup: Any = SimpleNamespace(files={}, loop=loop)
+    with pytest.raises(CheckFailedError, match=f"{other}.json: is of the robot") if other else nullcontext():
+        found = _certified.require_certified(setup, Path("c.npz"))
+        assert found is not None
+        assert [item.path for item in found] == ["verify.json", "simulate.json"]
+
+
 def test_arming_asks_for_the_limits_that_verify_stretched_to_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
     """The scale in the certificate counts, 1 where it says none; a metric that the robot has not is not asked for."""
     asked: list[Any] = []

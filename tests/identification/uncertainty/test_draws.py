@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -104,7 +106,7 @@ def recordings_start(found: Draws) -> np.ndarray:
     return np.ones((50, len(found.model.robot.motors.names)))
 
 
-@pytest.mark.parametrize("spoil", ["shape", "nan", "few", "share", "noise", "share inf", "noise nan"])
+@pytest.mark.parametrize("spoil", ["shape", "nan", "last nan", "few", "share", "noise", "share inf", "noise nan"])
 def test_draws_that_do_not_fit_their_model_are_refused(made: Callable[..., Draws], spoil: str) -> None:
     found = made()
     header, arrays = found.to_archive()
@@ -112,6 +114,9 @@ def test_draws_that_do_not_fit_their_model_are_refused(made: Callable[..., Draws
         arrays["drawn_weights"] = arrays["drawn_weights"][:, :, :-1]
     elif spoil == "nan":
         arrays["drawn_weights"] = np.full_like(arrays["drawn_weights"], np.nan)
+    elif spoil == "last nan":
+        arrays["drawn_weights"] = arrays["drawn_weights"].copy()
+        arrays["drawn_weights"][-1, -1, -1] = np.nan
     elif spoil == "few":
         arrays["drawn_weights"] = arrays["drawn_weights"][:4]
     else:
@@ -119,6 +124,100 @@ def test_draws_that_do_not_fit_their_model_are_refused(made: Callable[..., Draws
         arrays[name] = arrays[name] * float(value) if value else -arrays[name]
     with pytest.raises(FileFormatError, match="draws"):
         Draws.from_archive(header, arrays)
+
+
+@pytest.mark.parametrize("number", [0, 3, -1])
+def test_every_draw_of_a_file_must_be_a_model(
+    made: Callable[..., Draws], number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    header, arrays = made().to_archive()
+    spoilt = arrays["drawn_weights"][number].tobytes()
+
+    def check(_: str, found: dict[str, np.ndarray]) -> None:
+        if found["weights"].tobytes() == spoilt:
+            raise FileFormatError("no model")
+
+    monkeypatch.setattr(_draws, "check_arrays", check)
+    with pytest.raises(FileFormatError, match="no model"):
+        Draws.from_archive(header, arrays)
+
+
+def segments(y: np.ndarray, noise: float = 0.0) -> _draws._Motions:
+    """Return two segments of five rows, the first of small motions."""
+    groups, nothing = np.repeat([0, 1], 5), SimpleNamespace()
+    return _draws._Motions(nothing, nothing, y, groups, np.array([0.1, 1.0]), np.array([0, 2]), np.full(2, noise))  # pyright: ignore[reportArgumentType]
+
+
+def test_a_band_is_as_wide_as_its_farthest_draws_and_each_output_of_a_row_is_in_it_or_not() -> None:
+    rng = np.random.default_rng(0)
+    Y = rng.normal(size=(4, 10, 2))
+    low, high = segments(Y[0]).band(Y, np.zeros(2), 0.0)
+    np.testing.assert_array_equal(low, Y.min(axis=0))
+    np.testing.assert_array_equal(high, Y.max(axis=0))
+    wider = segments(Y[0], noise=0.1).band(Y, np.zeros(2), 0.0)
+    np.testing.assert_allclose(wider[1] - high, 1.96 * 0.1)
+    np.testing.assert_allclose(low - wider[0], 1.96 * 0.1)
+    # One output of one row of ten values beyond, above or below, or no number.
+    for far in (high[7, 1] + 0.1, low[7, 1] - 0.1, np.nan):
+        y = Y[0].copy()
+        y[7, 1] = far
+        found = segments(y)
+        assert [row["covered"] for row in found.coverage(Y, np.zeros(2), 0.0)] == [1.0, 0.9]
+        assert [row["class"] for row in found.coverage(Y, np.zeros(2), 0.0)] == ["small", "large"]
+        assert not found.covers(Y, np.zeros(2), 0.0)
+    assert segments(Y[0]).covers(Y, np.zeros(2), 0.0)
+
+
+@pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf])
+def test_a_draw_that_diverges_makes_its_segment_infinitely_bad_and_no_other(lost: float) -> None:
+    rng = np.random.default_rng(0)
+    y, Y = rng.normal(size=(10, 2)), rng.normal(size=(4, 10, 2))
+    scores = segments(y).scores(Y)
+    assert np.isfinite(scores).all()
+    for draw in range(4):
+        spoilt = Y.copy()
+        spoilt[draw, 8, 1] = lost
+        assert segments(y).scores(spoilt).tolist() == [scores[0], np.inf]
+    # An error that grows in every draw never improves a score; small motions are judged by their own size.
+    assert (segments(y).scores(Y + 9.0) > scores).all()
+    assert segments(y).scores(np.broadcast_to(y + 0.1, Y.shape)) == pytest.approx([1.0, 0.1])
+
+
+def test_what_a_recording_moves_is_the_largest_from_its_middle() -> None:
+    y = np.array([[0.0, 5.0], [0.1, 5.0], [-0.4, 5.0], [0.0, 7.0], [np.nan, 5.0]])
+    recording: Any = SimpleNamespace(outputs=y)
+    assert _draws._motion(recording) == pytest.approx([0.4, 2.0])
+
+
+def test_draws_come_from_grey_boxes_with_and_without_parts_or_else_from_play(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing: Any = SimpleNamespace()
+    monkeypatch.setattr(_draws.GreyBoxDraws, "fit", lambda *_, body, **__: body)
+    monkeypatch.setattr(_draws.PlayDraws, "fit", lambda *_, **__: "play")
+    assert _draws._sources(nothing, lambda *_: None) == ["rigid", "all"]
+
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise SettingsError("no winches")
+
+    monkeypatch.setattr(_draws.GreyBoxDraws, "fit", refuse)
+    assert _draws._sources(nothing, lambda *_: None) == ["play"]
+
+
+@pytest.mark.parametrize(("first", "power"), [(0, 0), (3, 3), (None, 24)])
+def test_a_disturbance_is_raised_until_all_is_covered_and_at_most_tenfold(
+    made: Callable[..., Draws], first: int | None, power: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[np.ndarray] = []
+    whole = made()
+
+    def covers(_: Any, __: Any, share: np.ndarray, ___: float) -> bool:
+        asked.append(share)
+        return first is not None and len(asked) > first
+
+    monkeypatch.setattr(_draws._Motions, "covers", covers)
+    found = made.__wrapped__()  # pyright: ignore[reportFunctionMemberAccess] - with this band
+    np.testing.assert_allclose(found.share, 1.1**power * asked[0])
+    # It tells itself what it then covers.
+    assert [row["class"] for row in found.coverage] == [row["class"] for row in whole.coverage]
 
 
 @pytest.mark.parametrize("worse_first", [False, True])
