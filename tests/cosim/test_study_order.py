@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import math
 from itertools import permutations
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from softneck.core import SettingsError
+from softneck.core import DataError, SettingsError, metric_of
 from softneck.cosim import group_runs, pareto_front, rank, worst_runs
-from softneck.cosim.studies._store import _spread
+from softneck.cosim.studies import _run_study
+from softneck.cosim.studies._store import _spread, read_tables
+from softneck.cosim.studies._study import Vary
 from softneck.loop import metric_names
 from softneck.robot import Robot
 
@@ -39,6 +44,8 @@ def spread(values: Any, metric: str) -> tuple[float, ...]:
 
 @pytest.mark.parametrize("metric", METRICS)
 def test_a_worse_run_never_improves_a_group_and_a_better_one_leaves_its_worst(metric: str) -> None:
+    # Groups, ranks and fronts minimise: a metric that is better when larger needs its own direction there.
+    assert not metric_of(metric).larger
     members = (3.0, 1.0, 2.0)
     base = spread(members, metric)
     assert base == (2.0, 3.0, 3.0)
@@ -75,6 +82,41 @@ def test_a_failed_run_counts_in_the_spread_and_in_the_share_that_holds() -> None
     # Without limits nothing holds or fails.
     assert math.isnan(grouped(runs_of((1.0, 2.0)))["holds [%]"])
     assert math.isnan(grouped(runs_of((1.0, 2.0), errors=["", "gone"]))["holds [%]"])
+
+
+@pytest.mark.parametrize("limits", [(), ("limit",)])
+@pytest.mark.parametrize("holds", [True, False])
+def test_a_run_tells_its_metrics_and_whether_its_limits_hold_if_it_has_some(
+    limits: tuple[str, ...], holds: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    setup = SimpleNamespace(limits=limits, loop=SimpleNamespace(parts={}))
+    result = SimpleNamespace(metrics={"pitch": {"rms_error_deg": 1.5, "rise_s": 9.0}}, holds=holds)
+    monkeypatch.setattr(_run_study, "make_loop", lambda *_, **__: setup)
+    monkeypatch.setattr(_run_study, "run_setup", lambda *_, **__: result)
+    point: Any = SimpleNamespace(run=3, sample=1, seed=7, labels={"kind": "a"}, values={})
+    chunk = _run_study.Chunk("", {}, Path(), [point], (ERROR,))
+    (row,) = _run_study.run_chunk(chunk)
+    assert row.pop("seconds") >= 0.0
+    expected = {"run": 3, "sample": 1, "seed": 7, "kind": "a", "error": ""}
+    assert row == {**expected, ERROR: 1.5, "holds": holds if limits else None}
+    # A run that broke off has no metric, and one whose worker died holds nothing.
+    for error, said in ((DataError("it\nis gone"), "it is gone"), (ValueError("no"), "ValueError: no")):
+        monkeypatch.setattr(_run_study, "run_setup", Mock(side_effect=error))
+        (row,) = _run_study.run_chunk(chunk)
+        assert (row["error"], row[ERROR], row["holds"]) == (said, None, None)
+    dead = _run_study.failed_row(point, "died", (ERROR,))
+    assert dead == {**expected, ERROR: None, "holds": False, "error": "died", "seconds": None}
+
+
+def test_a_run_that_is_on_the_disk_twice_counts_once(tmp_path: Path) -> None:
+    files = [tmp_path / name for name in ("a.csv", "b.csv")]
+    for file, numbers in zip(files, ((2, 0), (0, 1)), strict=True):
+        # As of a run that was repeated: the same numbers, in another time.
+        runs = runs_of([10.0 + number for number in numbers]).assign(run=numbers, seconds=file.name == "b.csv")
+        runs.to_csv(file, index=False)
+    table = read_tables(files, {"kind": Vary("choices", labels=("a",))})
+    assert table["run"].tolist() == [0, 1, 2]
+    assert table[ERROR].tolist() == [10.0, 11.0, 12.0]
 
 
 def test_groups_keep_their_own_runs() -> None:

@@ -12,6 +12,8 @@ import pytest
 from softneck.core import load
 from softneck.estimation import KalmanObserver, KalmanSettings
 from softneck.estimation._observer import (
+    _estimate_lag,
+    _unexplained_share,
     estimate_sensor_delay,
     fit_levels_and_delays,
     most_likely_extra_delay,
@@ -121,3 +123,21 @@ def test_the_file_keeps_where_the_delay_comes_from(tmp_path: Path) -> None:
     observer.save(tmp_path / "o.npz")
     again = load(tmp_path / "o.npz", role="observer")
     assert (again.delay_source, again.summary()) == ("gyro", observer.summary())
+
+
+def test_a_lag_is_that_of_all_outputs_and_none_at_the_end_of_the_search() -> None:
+    rng = np.random.default_rng(0)
+    way = np.cumsum(rng.standard_normal((500, 2)), axis=0)
+
+    def late(samples: int) -> np.ndarray:
+        return np.vstack([np.repeat(way[:1], samples, axis=0), way])[: len(way)]
+
+    assert _estimate_lag([(late(3), way)], TS) == pytest.approx(3 * TS)
+    # The longest of the search, 0.2 s, may be longer still.
+    assert _estimate_lag([(late(9), way)], TS) == pytest.approx(9 * TS)
+    assert _estimate_lag([(late(10), way)], TS) is None
+    for axis in (0, 1):
+        z = late(3)
+        z[:, axis] = np.cumsum(rng.standard_normal(500))
+        assert _unexplained_share([(z, way)], 3.0) > 0.2
+        assert _estimate_lag([(z, way)], TS) is None

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import control
 import numpy as np
 import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError, load, read_archive, write_archive
-from softneck.estimation import KalmanSettings, LinearNeck, axis_plant
+from softneck.estimation import KalmanSettings, LinearNeck, _kalman_runtime, axis_plant
+from softneck.estimation import _kalman_parts_runtime as _parts
 from softneck.estimation._settings import SENSORS
 from softneck.signals import Recording
 
@@ -242,3 +245,31 @@ def test_a_noise_parameter_out_of_range_is_refused() -> None:
 
 def test_sensors_are_named_as_they_are_listed() -> None:
     assert all(name == sensor.name and sensor.noise_std > 0 for name, sensor in SENSORS.items())
+
+
+def test_inputs_are_kept_for_the_longest_lag_of_any_output() -> None:
+    constants = np.ones(_parts.KALMAN_MORE_LAGS + 2)
+    places = (_parts.KALMAN_LAG, _parts.KALMAN_LAG + 1, _parts.KALMAN_MORE_LAGS, _parts.KALMAN_MORE_LAGS + 1)
+    for axis, place in enumerate(places):
+        for lag, rows in ((4.0, 5), (4.25, 6)):
+            later = constants.copy()
+            later[place] = lag
+            assert _parts.kalman_line_length(later) == rows
+            assert _parts.kalman_lag(later, axis) == lag
+
+
+@pytest.mark.parametrize("outputs", [2, 3])
+def test_an_innovation_that_is_no_number_passes_no_gate(outputs: int) -> None:
+    n = outputs
+    constants = np.full(12, 9.0)
+    p: Any = SimpleNamespace(H=np.eye(n), constants=constants, outputs=outputs, n=n)
+    for spoilt, accepted in ((1.0, True), (math.nan, False), (math.inf, False)):
+        x: Any = SimpleNamespace(x=np.zeros(n), log_det=0.0)
+        P = np.eye(n)
+        measured = np.full(n, 0.1)
+        measured[-1] *= spoilt
+        with np.errstate(all="ignore"):
+            found = _kalman_runtime.kalman_correct(p, 0.1, x, P, measured, False)
+        assert found[1] is accepted
+        # What is refused leaves no trace.
+        assert (x.x.any(), (np.eye(n) == P).all()) == (accepted, not accepted)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
 from softneck.estimation import KalmanObserver, consistency, fit_noise
+from softneck.estimation._noise import find_outliers, look_ahead_error
+from softneck.estimation._offline import measured_angles
 from softneck.signals import Recording
 
 from .necks import IN_TIME, changed, neck, recording
@@ -135,3 +139,40 @@ def test_too_little_data_is_refused() -> None:
         consistency(observer_of(), record, level=1.0)
     with pytest.raises(DataError, match="sample time"):
         fit_noise(observer_of(), replace(record, time=record.time / 2, sample_time=0.01))
+
+
+def test_an_outlier_of_any_output_is_one_and_what_moves_on_is_none() -> None:
+    y = 1e-3 * np.random.default_rng(0).standard_normal((200, 2))
+    assert not find_outliers(y).any()
+    for axis in (0, 1):
+        z = y.copy()
+        z[50, axis] += 1.0
+        assert np.flatnonzero(find_outliers(z)).tolist() == [50]
+        z[50:, axis] += 1.0
+        assert np.flatnonzero(find_outliers(z)).tolist() in ([50], [])
+        # Beside a sample that is missing its neighbours are those that came.
+        z = y.copy()
+        z[50, axis], z[51] = 1.0, np.nan
+        assert np.flatnonzero(find_outliers(z)).tolist() == [50]
+
+
+@pytest.mark.parametrize("lost", [math.nan, math.inf])
+def test_one_estimate_that_is_no_number_is_an_infinite_error(lost: float) -> None:
+    record = recording(rows=200)
+    finite: Any = SimpleNamespace(lead=0.0, sample_time=0.02, estimate=lambda _: SimpleNamespace(outputs=truth.copy()))
+    truth = measured_angles(record) + 0.01
+    assert look_ahead_error(finite, record) == pytest.approx(0.01)
+    # Rows 20 to 24 of each 25 are withheld and compared.
+    truth[199 - 3, 0] = lost
+    assert look_ahead_error(finite, record) == math.inf
+
+
+def test_consistency_counts_what_the_gate_refused() -> None:
+    record = recording(rows=200)
+    judged, accepted = np.ones(200, dtype=bool), np.arange(200) % 10 > 2
+    judged[100:110] = False
+    estimates = SimpleNamespace(judged=judged, accepted=accepted & judged, innovation=np.where(accepted, 2.0, 50.0))
+    filtered: Any = SimpleNamespace(estimate=lambda _: estimates)
+    found = consistency(filtered, record, settle=50)
+    # 150 rows but for ten without a measurement, three of ten of them refused; a refused one has no part in the mean.
+    assert (found.rejected, found.taken, found.mean, found.inside) == (42, 98, 2.0, 1.0)

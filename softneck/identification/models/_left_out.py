@@ -55,7 +55,9 @@ def agreement(runs: Mapping[str, Sequence[Matrix]], worth: Mapping[str, float]) 
 def _fit(middle: Matrix, free: Matrix) -> float:
     if not np.isfinite(free).all():
         return float("-inf")
-    return float(np.mean([nrmse_fit(y, yhat) for y, yhat in zip(middle.T, free.T, strict=True)]))
+    fits = [nrmse_fit(y, yhat) for y, yhat in zip(middle.T, free.T, strict=True)]
+    # An output that rests has no fit, and hides no other's.
+    return float(np.mean([fit for fit in fits if not np.isnan(fit)] or fits))
 
 
 def weighted_median(values: np.ndarray, weights: Vector) -> Matrix:

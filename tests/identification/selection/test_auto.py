@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -188,6 +189,68 @@ def test_a_model_that_parts_from_the_others_where_nobody_measured_agrees_least()
     # Independent errors of a tenth leave 90 %; the median, which errs less, has part in each.
     assert all(85.0 < found[name] < 97.0 for name in "abc")
     assert agreement({"a": runs["a"], "b": runs["b"]}, {"a": 90.0, "b": 90.0}) == {}
+
+
+def test_what_diverges_agrees_with_nothing_and_an_output_at_rest_hides_no_other() -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.standard_normal((400, 2))
+    runs = {name: [truth + 0.1 * rng.standard_normal(truth.shape) for _ in range(2)] for name in "abc"}
+    worth = dict.fromkeys("abc", 90.0)
+    whole = agreement(runs, worth)
+    # The least of all motions counts, in whatever order they stand.
+    poor = {**runs, "a": [runs["a"][0], runs["a"][1] + rng.standard_normal(truth.shape)]}
+    assert agreement(poor, worth)["a"] < whole["a"] - 20.0
+    assert agreement({name: free[::-1] for name, free in poor.items()}, worth) == agreement(poor, worth)
+    for lost in (np.nan, np.inf):
+        gone = runs["a"][1].copy()
+        gone[3, 1] = lost
+        found = agreement({**runs, "d": [runs["a"][0], gone]}, worth)
+        assert found == {**whole, "d": float("-inf")}
+    still = {name: [free * np.array([1.0, 0.0]) for free in each] for name, each in runs.items()}
+    alone = {name: [free[:, :1] for free in each] for name, each in runs.items()}
+    assert agreement(still, worth) == agreement(alone, worth)
+
+
+def test_a_kind_is_worth_its_worst_test_and_no_fit_of_an_output_vanishes() -> None:
+    one = KindTrial("rls", 0.0, left_out={"fast": 60.0, "large": 40.0, "later": 50.0})
+    assert (one.fit, one.worst) == (40.0, "large")
+    lost = replace(one, left_out={**one.left_out, "later": float("-inf")})
+    assert (lost.fit, lost.worst) == (float("-inf"), "later")
+    assert KindTrial("rls", 0.0).worst == ""
+    assert _auto._mean({"pitch": 90.0, "roll": 60.0}) == 75.0
+    for fits in ({"pitch": 90.0, "roll": None}, {"pitch": None, "roll": 90.0}, {"pitch": None}, {}):
+        assert _auto._mean(fits) == float("-inf")
+
+
+def test_a_kind_that_fails_without_a_part_is_infinitely_bad_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    part: Any = SimpleNamespace(name="excitation 1", fits=lambda _: ({"pitch": 80.0, "roll": 60.0}, 2.0))
+    fold: Any = SimpleNamespace(train=TRAIN, judged=(part,))
+    trying = _Race(TRAIN, OTHER, [fold], 0)
+    trying.tried["rls"] = KindTrial("rls", 1.0, left_out={"fast": 90.0})
+    monkeypatch.setattr(_Race, "_short", lambda *_: "model")
+    trying._leave_out("rls", fold)
+    assert trying.tried["rls"].left_out == {"fast": 90.0, "excitation 1": 70.0}
+
+    def fails(*_: Any) -> Any:
+        raise ValueError("singular")
+
+    monkeypatch.setattr(_Race, "_short", fails)
+    trying._leave_out("rls", fold)
+    assert trying.tried["rls"].left_out == {"fast": 90.0, "excitation 1": float("-inf")}
+
+
+def test_of_the_linear_kinds_the_best_alone_votes_and_all_are_examined(monkeypatch: pytest.MonkeyPatch) -> None:
+    fold: Any = SimpleNamespace(train=TRAIN, judged=(1,))
+    trying, voted = _Race(TRAIN, OTHER, [fold], 0), dict[str, float]()
+    for kind, fit in (("rls", 70.0), ("oe", 85.0), ("play", 60.0), ("nn", 50.0)):
+        trying.tried[kind] = KindTrial(kind, 1.0, "model", left_out={"fast": fit})  # pyright: ignore[reportArgumentType]
+    trying.tried["nlsm"] = KindTrial("nlsm", 1.0, failure="no")
+    monkeypatch.setattr(_auto, "exams", lambda _: ["motion"])
+    monkeypatch.setattr(_auto, "free_runs", lambda model, _: model)
+    monkeypatch.setattr(_auto, "agreement", lambda runs, worth: voted.update(worth) or dict.fromkeys(runs, 33.0))
+    trying.examine()
+    assert voted == {"oe": 85.0, "play": 60.0, "nn": 50.0}
+    assert [one.kind for one in trying.tried.values() if one.left_out.get(EXAM) == 33.0] == ["rls", "oe", "play", "nn"]
 
 
 def test_a_weighted_median_is_that_of_values_repeated_as_often() -> None:
