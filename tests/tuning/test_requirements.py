@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import control
 import numpy as np
@@ -22,13 +25,14 @@ from softneck.robot import TIME_CONSTANT, Robot
 from softneck.tuning._requirements import (
     _TRACK_NUMBERS,
     USUAL_RISE,
+    _refuse_load,
     check_feasibility,
     default_rise,
     make_tune_requirements,
     read_tune_requirements,
 )
 from softneck.tuning._tune import task_of
-from softneck.verification import make_requirements, read_requirements
+from softneck.verification import Requirement, make_requirements, read_requirements
 from softneck.verification._metrics import Scale
 
 TS = 0.02
@@ -284,6 +288,26 @@ def test_default_payloads_go_to_the_heaviest_recorded_one_and_stated_ones_stay(
     stated = make_tune_requirements({"sim": {"payloads_kg": [0.7]}}, payload=payload)
     assert stated.certificate.sim["payloads_kg"] == [0.7]
     assert ("sim.payloads_kg" in stated.stated, "sim.payloads_kg" in asked.stated) == (True, False)
+
+
+def test_what_is_stated_is_what_a_table_limits_and_not_what_it_drops() -> None:
+    require = {"sim.rise_s": {"max": 0.5}, "sim.settling_s": False, "track.circle_rms_deg": {"max": 4.0}}
+    asked = make_tune_requirements({"require": require, "track": {"delay_ms": 7.0}, "sim": {"size_deg": 9.0}})
+    assert asked.stated == {"sim.rise_s", "track.circle_rms_deg", "track.delay_ms", "sim.size_deg"}
+    assert make_tune_requirements({}).stated == frozenset()
+
+
+@pytest.mark.parametrize(("delay", "rows"), [(0, 1), (4, 5), (50, 51), (150, 49), (199, 0), (300, 0)])
+def test_a_load_moves_a_plant_for_its_dead_time_within_the_rows_that_are_judged(delay: int, rows: int) -> None:
+    """Of 200 rows, those from the dead time to another one later, each by the gain times the load."""
+    gain, load = 0.1, 0.5
+    plant: Any = SimpleNamespace(sample_time=TS, delay=delay, numerator=np.array([gain]), denominator=np.array([1.0]))
+    least = math.degrees(gain * load) * math.sqrt(rows / 200)
+    for limit in (1.001 * least, 0.999 * least):
+        asked = replace(make_tune_requirements({}), certificate=make_requirements({"step": {"load_rad": load}}))
+        asked = replace(asked, bounds=(Requirement("step.load_rms_deg", "max", limit, True),))
+        with nullcontext() if limit >= least else pytest.raises(SettingsError, match="dead time before any feedback"):
+            _refuse_load(asked, "pitch", plant)
 
 
 def test_settling_is_judged_by_the_sensor_up_to_the_noise_that_fits_the_band() -> None:

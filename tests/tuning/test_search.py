@@ -172,13 +172,14 @@ def test_a_log_gives_back_what_was_judged_and_has_refusals_tried_again(tmp_path:
 
 
 def test_work_is_given_out_two_to_a_worker_and_all_of_it_comes_back() -> None:
-    out: list[Job] = []
+    out, given = list[Job](), list[Job]()
 
     class Lazy:
         size = 2
 
     def run(job: Job) -> Future:
         out.append(job)
+        given.append(job)
         assert len(out) <= 4
         future: Future = Future()
         future.set_result(job.settings)
@@ -192,6 +193,8 @@ def test_work_is_given_out_two_to_a_worker_and_all_of_it_comes_back() -> None:
 
     run_jobs(jobs, run, Lazy(), took)  # pyright: ignore[reportArgumentType]
     assert sorted(back, key=lambda pair: pair[1]) == [(job, job.settings) for job in jobs]
+    # The better ones stand first: a search that is stopped has judged those.
+    assert given == jobs
 
 
 @pytest.mark.parametrize("kind", [*KINDS_SEARCHED, "nmpc"])
