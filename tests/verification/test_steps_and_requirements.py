@@ -253,6 +253,9 @@ def test_a_flat_table_is_of_simulation_models_where_there_are_any() -> None:
         "require": {"step.rise_s": 1, "axes.gain_margin": {"min": 2}, "robust.mu": {"below": 1}},
     }
     assert flat(True, slack_s=False)["require"] == {"sim.slack_s": False}
+    # A table that nobody knows is left to be refused, and hides no limit that stands after it.
+    found = flat(False, stepp={"size_deg": 9.0}, gain_margin=2)
+    assert found == {"stepp": {"size_deg": 9.0}, "require": {"axes.gain_margin": {"min": 2}}}
     for wrong in ({"overshot_pct": 5}, {"rise_s": 1, "require": 5}):
         with pytest.raises(SettingsError):
             flat(True, **wrong)
