@@ -318,12 +318,12 @@ def test_calibrated_bounds_need_nine_records_and_an_error_in_each() -> None:
     gone[:n, 1] = math.nan
     assert calibrated_bounds(rows, gone)["records"] == 8
     assert "need 9" in calibrated_bounds(rows, gone)["reason"]
-    # Wider than half of what was measured: said, and no number.
-    loud = errors * [1.0, 13.0]
-    found = calibrated_bounds(rows, loud)
-    assert "roll" not in found["path"]
-    assert "pitch" in found["path"]
-    assert "no useful path bound in roll" in found["reason"]
+    # Wider than half of what was measured: said, no number, and the other output keeps its own.
+    for wide, other, factors in (("roll", "pitch", [1.0, 13.0]), ("pitch", "roll", [51.0, 1.0])):
+        bounds = calibrated_bounds(rows, errors * factors)
+        for what in ("path", "pointwise"):
+            assert bounds[what] == {other: found[what][other]}
+            assert f"no useful {what} bound in {wide}" in bounds["reason"]
 
 
 def test_reliability_counts_every_row_once_in_its_tenth() -> None:
