@@ -40,6 +40,7 @@ from softneck.identification.validation._score_tables import (
     fit_intervals,
     interval_tables,
     outside_table,
+    run_tables,
     score_tables,
 )
 from softneck.robot import Robot, Scaling
@@ -178,6 +179,29 @@ def test_a_simulation_has_left_where_any_output_has_and_each_segment_says_when()
         bad = y.copy()
         bad[250, 0] = lost
         assert divergence(rows, bad) == [None, None, rows.time[250], None]
+
+
+def test_each_segment_has_scores_of_its_own_rows_and_says_where_it_begins() -> None:
+    y, yhat = signals(400)
+    rows, lost = rows_of(y, segments=4), [None, 5.5, None, None]
+    segments: Any = [
+        SimpleNamespace(run=k // 2, scored=np.arange(100) >= 10 * k,
+                        recording=SimpleNamespace(time=rows.time[rows.segment == k])) for k in range(4)
+    ]  # fmt: skip
+    found = run_tables(segments, rows, {INFINITE: y, "1": y}, {INFINITE: yhat, "1": y}, lost)
+    assert [(entry["stretch"], entry["run"], entry["diverged"]) for entry in found] == [
+        (k, k // 2, lost[k]) for k in range(4)
+    ]
+    assert [entry["start_s"] for entry in found] == [rows.time[100 * k] for k in range(4)]
+    assert [entry["rows_scored"] for entry in found] == [100 - 10 * k for k in range(4)]
+    for k, entry in enumerate(found):
+        at = rows.segment == k
+        for i, name in enumerate(rows.names):
+            expected = None if lost[k] else nrmse_fit(y[at, i], yhat[at, i])
+            assert entry["fits"][INFINITE][name] == expected
+            assert entry["fits"]["1"][name] == 100.0
+            row = np.flatnonzero(at)[int(np.argmax(np.abs(y[at, i] - yhat[at, i])))]
+            assert lost[k] or entry["worst_time_s"][INFINITE][name] == rows.time[row]
 
 
 def test_three_ranges_from_the_middle_are_gone_and_an_angle_at_half_a_turn_as_well() -> None:
