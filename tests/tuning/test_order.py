@@ -743,6 +743,47 @@ def test_a_search_judges_starts_generations_neighbours_and_finals_within_its_bud
     assert (said[-1] == ("margins", finals, 0)) is bool(finals)
 
 
+@pytest.mark.parametrize(("budget", "level"), [(500, "all"), (9, "all"), (500, "linear")])
+def test_neighbours_of_the_best_are_judged_on_both_sides_until_none_is_better(
+    budget: int, level: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search, rounds = searching("a", budget=budget), list[tuple[np.ndarray, np.ndarray]]()
+    best = np.array([0.4, 0.6])
+    valley = np.array([0.55, 0.45])
+
+    def judged(x: np.ndarray, level: str) -> Candidate:
+        made = Candidate("a", {}, x, level, {"m": 1.0 + float(np.hypot(*(x - valley)))})
+        return search.candidates.setdefault(("a", str(x)), made)
+
+    judged(best, level)
+    monkeypatch.setattr(Search, "_candidate", lambda _, __, x: x)
+
+    def judge(_: Search, near: Any, levels: Any, finals: int) -> None:
+        assert (levels, finals) == (LEVELS[:2], 3)
+        rounds.append((search.sort_candidates()[0].x, np.array(near)))
+        for x in near:
+            judged(x, LEVELS[1])
+            search.spent.add(Job("a", str(len(search.spent)), "all"))
+
+    monkeypatch.setattr(Search, "_judge_levels", judge)
+    search._refine(LEVELS[:2], 3)
+    if level == "linear":  # the best was not judged to its end
+        assert not rounds
+        return
+    # Four to a round, while more is left than the finals need.
+    assert len(rounds) == 2 if budget == 9 else len(rounds) > 5
+    away = _search._FIRST_DISTANCE
+    for (at, near), (after, _) in zip(rounds, [*rounds[1:], (search.sort_candidates()[0].x, None)], strict=True):
+        sides = (near - at).reshape(2, 2, 2)
+        np.testing.assert_allclose(sides[:, 0], -sides[:, 1], atol=1e-12)
+        np.testing.assert_allclose(sides[:, 0] @ sides[:, 0].T, away**2 * np.eye(2), atol=1e-12)
+        away /= 2.0 if after is at else 1.0
+    if budget == 500:
+        assert away <= _search._LAST_DISTANCE
+        # Of directions that turn each round one leads down until a step is no longer than what is left.
+        assert np.hypot(*(search.sort_candidates()[0].x - valley)) < _search._FIRST_DISTANCE / 4.0
+
+
 # -- the end of a search ----------------------------------------------------------------------------------------------
 
 
