@@ -1164,16 +1164,25 @@ def test_a_ramp_arrives_where_every_motor_is_at_rest_long_enough_and_at_a_sample
         positions = [0.0, 0.0, 0.0]
         positions[motor] = position
         master.positions = tuple(positions)
-        master.cycle = 0
-        master._ramp(50.0, [])
-        master._ramp(50.0 + ramps.settle - 0.001, [])
-        assert master.supervisor.phase is Phase.RAMP_IN
+        for now in (50.0, 50.0 + ramps.settle - 0.001):
+            for master.cycle in (1, 0):
+                master._ramp(now, [])
+                assert master.supervisor.phase is Phase.RAMP_IN
         # Two cycles make a sample: the run starts with one.
         master._ramp(50.0 + ramps.settle, [])
         assert master.supervisor.phase is Phase.RAMP_IN
         master.cycle = 1
         master._ramp(50.0 + ramps.settle, [])
         assert (master.supervisor.phase is Phase.RUNNING) is there
+    # What leaves its rest waits again, from when it is back.
+    master = _master(Pilot())
+    master.supervisor.phase, master.cycle = Phase.RAMP_IN, 1
+    for now, position in ((50.0, 0.0), (50.1, 1.0), (50.2, 0.0), (50.0 + ramps.settle, 0.0)):
+        master.positions = tuple(position * (k == motor) for k in range(3))
+        master._ramp(now, [])
+        assert master.supervisor.phase is Phase.RAMP_IN
+    master._ramp(50.2 + ramps.settle, [])
+    assert master.supervisor.phase is Phase.RUNNING
 
 
 def test_a_condition_is_reported_once_it_lasted_for_its_time_and_begins_anew_after_a_gap() -> None:
