@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -90,6 +91,13 @@ def test_no_subpackage_imports_a_private_module_of_another() -> None:
             if private and not runtime and parts[1] != here:
                 problems.append(f"{name_of(path)}: {module}")
     assert problems == []
+
+
+def test_nothing_is_overwritten_unless_somebody_asks() -> None:
+    usual = {(name_of(path), word) for path in FILES
+             for word in re.findall(r"\bforce: bool = (\w+)", path.read_text(encoding="utf-8"))}  # fmt: skip
+    assert len(usual) > 10
+    assert {word for _, word in usual} == {"False"}
 
 
 def test_a_runtime_imports_numpy_math_and_other_runtimes_only() -> None:
