@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -40,6 +40,7 @@ from softneck.design.linear._axis_loop import (
 )
 from softneck.design.linear._controller import AxisController, ReferenceFilter
 from softneck.design.linear._pid import PidGains, _cost, _WorstCase
+from softneck.design.linear._settings import last_kept
 from softneck.design.plants._uncertain import StepAndLoad, UncertainAxis
 from softneck.estimation import AxisPlant
 
@@ -210,10 +211,10 @@ def test_a_conditioning_is_taken_for_its_worst_test_and_worst_sample(monkeypatch
 
 def test_every_sample_must_be_stable_and_keep_its_sensitivity(monkeypatch: pytest.MonkeyPatch) -> None:
     axis: Any = SimpleNamespace(samples=(0, 1, 2))
-    for sizes, keeps in (((1.6, 1.0, 1.2), True), ((1.0, 1.61, 1.2), False), ((1.0, 1.2, math.inf), False),
-                         ((math.nan, 1.0, 1.0), False)):  # fmt: skip
+    for sizes, largest in (((1.6, 1.0, 1.2), 1.6), ((1.0, 1.2, math.inf), math.inf), ((math.nan, 1.0, 1.0), math.nan)):
         monkeypatch.setattr(_settings, "sensitivities", lambda *_, sizes=sizes: np.array(sizes))
-        assert SETTINGS._keeps_sensitivity(None, axis) is keeps  # pyright: ignore[reportArgumentType]
+        found = SETTINGS._sensitivity(None, axis)  # pyright: ignore[reportArgumentType]
+        assert found == largest or math.isnan(largest) is math.isnan(found) is True
     for lost in ([], [2], [0, 1, 2]):
         monkeypatch.setattr(_settings, "unstable_samples", lambda *_, lost=lost: lost)
         if not lost:
@@ -221,6 +222,39 @@ def test_every_sample_must_be_stable_and_keep_its_sensitivity(monkeypatch: pytes
             continue
         with pytest.raises(SettingsError, match=rf"around {len(lost)} of 3 samples \(the first is sample {lost[0]}\)"):
             SETTINGS._require_stable(None, axis)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    "curve",
+    [
+        lambda x: x, lambda x: x**3, lambda x: math.expm1(6.0 * x), lambda x: -math.expm1(-6.0 * x),
+        lambda x: min(x, 0.01), lambda x: max(x, -1e-9), lambda x: math.copysign(1.0, x),
+        lambda x: x if x < 0.0 else 1.0, lambda x: x if x <= 0.0 else math.inf,
+    ],
+)  # fmt: skip
+def test_the_last_kept_is_that_of_all_halvings_by_fewer_tries(curve: Callable[[float], float]) -> None:
+    low, high, halvings, counts = 0.05, 5.0, 8, []
+    ends = np.geomspace(low, high, 2**halvings + 1)
+    for crossing in (*(ends[1:-1:9] * 1.001), *(ends[1:-1:9] * 0.999), 1.0001 * low, 0.9999 * high, 2.0 * high):
+        tried: list[float] = []
+
+        def excess(x: float, tried: list[float] = tried, crossing: float = crossing) -> float:
+            tried.append(x)
+            return curve(math.log(x / crossing))
+
+        found = last_kept(excess, low, high, begin=curve(math.log(low / crossing)), halvings=halvings)
+        a, b = low, high
+        for _ in range(halvings):
+            middle = math.sqrt(a * b)
+            a, b = (middle, b) if middle <= crossing else (a, middle)
+        assert found == a
+        assert len(tried) == len(set(tried))
+        assert low < min(tried)
+        assert max(tried) < high
+        counts.append(len(tried))
+    # Four tries may have followed nothing. Of a line in log(x) two halvings and both ends of an interval are tried.
+    assert max(counts) <= halvings + 4
+    assert (curve(-2.0), curve(2.0)) != (-2.0, 2.0) or np.mean(counts) < 0.6 * halvings
 
 
 def test_a_riccati_equation_without_a_solution_gives_no_conditioning(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from softneck.core import SettingsError
 from softneck.design import Margins, PiSettings, loop_margins, margins_of_loops, uncertain_plant
-from softneck.design.linear._margins import frequency_grid
+from softneck.design.linear._margins import frequency_grid, sensitivities_of_loops
 from softneck.estimation import LinearNeck
 
 
@@ -190,6 +190,7 @@ def test_margins_at_once_are_those_of_each_alone_and_an_unstable_loop_has_none()
     assert lost.sensitivity == lost.complementary == found.more[2, 0] == math.inf
     worst = found.worst()
     assert (worst.gain, worst.phase, worst.sensitivity) == (1.0, 0.0, math.inf)
+    np.testing.assert_array_equal(sensitivities_of_loops(evaluate, rows, 0.02, 3), found.sensitivity)
     # A loop whose poles are no numbers is not stable.
     rows[0] = np.nan
     assert margins_of_loops(evaluate, rows, 0.02, 3).of(0).sensitivity == math.inf

@@ -15,7 +15,14 @@ from softneck.runtime import load_functions
 
 from ..plants._uncertain import StepAndLoad, StepAndLoadResult, judge
 from ._controller import AxisController, ReferenceFilter
-from ._margins import LoopMargins, margins_of_loops, polynomials_at, sensitivity_of
+from ._margins import (
+    Evaluate,
+    LoopMargins,
+    margins_of_loops,
+    polynomials_at,
+    sensitivities_of_loops,
+    sensitivity_of,
+)
 
 # Lowest frequency on which a neck's loop is judged [rad/s]; loops of slower robots are from where their times are.
 LOWEST = 0.05
@@ -148,6 +155,13 @@ def delayed_form(plant: AxisPlant, extra_delay: int = 0) -> tuple[Matrix, Vector
 
 def axis_margins(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> LoopMargins:
     """Return the margins of the loops around `plants` with their exact delay; a loop that is not stable has none."""
+    return margins_of_loops(*_loops_around(axis, plants, extra_delay))
+
+
+def _loops_around(
+    axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int
+) -> tuple[Evaluate, np.ndarray, float, int]:
+    """Return what `margins_of_loops` takes."""
     dt, order = plants[0].sample_time, max(plant.order for plant in plants)
     above, below = np.zeros((len(plants), order)), np.zeros((len(plants), order + 1))
     for k, plant in enumerate(plants):
@@ -161,12 +175,12 @@ def axis_margins(axis: AxisController, plants: Sequence[AxisPlant], extra_delay:
         L = K * polynomials_at(above[rows], z) / polynomials_at(below[rows], z) * z ** -delays[rows].astype(float)
         return sensitivity_of(L)[:, None], np.zeros((w.size, 0))
 
-    return margins_of_loops(evaluate, closed_poles(axis, plants, extra_delay), dt, int(delays.max()))
+    return evaluate, closed_poles(axis, plants, extra_delay), dt, int(delays.max())
 
 
 def sensitivities(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> Vector:
     """Return Ms of every plant (plants,); inf where the loop is not stable."""
-    return axis_margins(axis, plants, extra_delay).sensitivity[:, 0]
+    return sensitivities_of_loops(*_loops_around(axis, plants, extra_delay))[:, 0]
 
 
 def coarse_frequencies(plant: AxisPlant) -> Vector:

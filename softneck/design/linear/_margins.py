@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -154,14 +154,7 @@ def margins_of_loops(evaluate: Evaluate, poles: np.ndarray, sample_time: float, 
 
     `poles`: (n, N) of the closed loops, padded with zeros. `delay`: of the loops [samples], at most.
     """
-    stable = np.flatnonzero(np.abs(poles).max(axis=1, initial=0.0) < 1.0)
-    w = frequency_grid(sample_time, delay)
-    # One row at least, for the number of channels.
-    tracked = stable if stable.size else np.arange(1)
-    tracks = [_Track.of(evaluate, tracked, np.broadcast_to(w, (tracked.size, w.size)))]
-    rows, close = _beside_poles(poles[tracked], sample_time, delay)
-    if rows.size:
-        tracks.append(_Track.of(evaluate, tracked[rows], close))
+    stable, tracks = _stable_tracks(evaluate, poles, sample_time, delay)
     c, best = tracks[0].S.shape[2], _peaks(evaluate, tracks, len(poles))
     found = LoopMargins(
         **_crossings(evaluate, tracks, len(poles), c), sensitivity=best[:, :c], complementary=best[:, c : 2 * c],
@@ -171,6 +164,30 @@ def margins_of_loops(evaluate: Evaluate, poles: np.ndarray, sample_time: float, 
     for name, value in _UNSTABLE.items():
         getattr(found, name)[lost] = value
     return found
+
+
+def sensitivities_of_loops(evaluate: Evaluate, poles: np.ndarray, sample_time: float, delay: int) -> np.ndarray:
+    """Return the sensitivity (n, c) of `margins_of_loops` alone, for a third of its time."""
+    stable, tracks = _stable_tracks(evaluate, poles, sample_time, delay)
+    c = tracks[0].S.shape[2]
+    best = _peaks(evaluate, [replace(track, sizes=track.sizes[:, :, :c]) for track in tracks], len(poles))
+    best[np.setdiff1d(np.arange(len(poles)), stable)] = math.inf
+    return best
+
+
+def _stable_tracks(
+    evaluate: Evaluate, poles: np.ndarray, sample_time: float, delay: int
+) -> tuple[np.ndarray, list[_Track]]:
+    """Return the rows of the stable loops, and their responses: on the grid, and beside lightly damped poles."""
+    stable = np.flatnonzero(np.abs(poles).max(axis=1, initial=0.0) < 1.0)
+    w = frequency_grid(sample_time, delay)
+    # One row at least, for the number of channels.
+    tracked = stable if stable.size else np.arange(1)
+    tracks = [_Track.of(evaluate, tracked, np.broadcast_to(w, (tracked.size, w.size)))]
+    rows, close = _beside_poles(poles[tracked], sample_time, delay)
+    if rows.size:
+        tracks.append(_Track.of(evaluate, tracked[rows], close))
+    return stable, tracks
 
 
 # Of a loop that is not stable.

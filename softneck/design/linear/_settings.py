@@ -346,9 +346,9 @@ class AxisSettings(LoopSettings, ABC):
         """Return the samples ready for steps within the limits of the motors."""
         return make_sweep(axis.samples, extra_delay=self.extra_delay, test=axis.test)
 
-    def _keeps_sensitivity(self, controller: AxisController, axis: UncertainAxis) -> bool:
-        """Return whether every sample is stable and keeps `max_sensitivity`."""
-        return bool(sensitivities(controller, axis.samples, self.extra_delay).max() <= self.max_sensitivity)
+    def _sensitivity(self, controller: AxisController, axis: UncertainAxis) -> float:
+        """Return the largest Ms of the samples; inf where one is not stable."""
+        return float(sensitivities(controller, axis.samples, self.extra_delay).max())
 
     def _fastest(
         self, build: Callable[[float], AxisDesign], axis: UncertainAxis, *, low: float, high: float, what: str
@@ -359,24 +359,69 @@ class AxisSettings(LoopSettings, ABC):
             SettingsError: not even the lowest does.
         """
         best: AxisDesign | None = None
-        tried = low
-        found = _try_build(build, tried)
-        if found is not None and self._keeps_sensitivity(found.controller, axis):
+
+        def excess(speed: float) -> float:
+            """Return how far the distance to -1 is below the one required; at most 0 where it is kept."""
+            nonlocal best
+            found = _try_build(build, speed)
+            peak = math.inf if found is None else self._sensitivity(found.controller, axis)
+            if not peak <= self.max_sensitivity:
+                return 1.0 / self.max_sensitivity - (1.0 / peak if peak > 0.0 else 0.0)
             best = found
+            return 1.0 / self.max_sensitivity - 1.0 / peak
+
+        begin = excess(low)
         if best is None:
             raise SettingsError(
                 f"not even a {what} of {low:.3g} rad/s keeps Ms <= {self.max_sensitivity:g} on all "
                 f"{len(axis.samples)} samples; raise `max_sensitivity`, or give `{what}` and see what is lost."
             )
         # Two decades to 3 %.
-        for _ in range(math.ceil(math.log2(math.log(high / low) / 0.03))):
-            tried = math.sqrt(low * high)
-            found = _try_build(build, tried)
-            if found is not None and self._keeps_sensitivity(found.controller, axis):
-                low, best = tried, found
-            else:
-                high = tried
+        last_kept(excess, low, high, begin=begin, halvings=math.ceil(math.log2(math.log(high / low) / 0.03)))
         return best
+
+
+def last_kept(excess: Callable[[float], float], low: float, high: float, *, begin: float, halvings: int) -> float:
+    """Return the end at which the excess is at most 0 after halvings of log(low) to log(high), by fewer tries.
+
+    The excess is `begin` <= 0 at `low` and changes its sign once; at `high`, which is not tried, it counts as positive.
+    Tried are the ends of the last interval where a parabola through three tries crosses 0, in the end halvings.
+    """
+    kept, lost, before, tries = (low, begin), (high, math.inf), (high, math.inf), 0
+    while True:
+        # A function that five tries did not follow is halved.
+        halved = math.isinf(lost[1]) or tries > 4
+        crossing = math.nan if halved else _crossing(kept, lost, before)
+        a, b = low, high
+        for _ in range(halvings):
+            middle = math.sqrt(a * b)
+            inside = kept[0] < middle < lost[0]
+            if inside and halved:
+                a = middle
+                break
+            a, b = (middle, b) if middle <= kept[0] or (inside and middle <= crossing) else (a, middle)
+        if (a, b) == (kept[0], lost[0]):
+            return a
+        tried = a if a > kept[0] else b
+        found = (tried, excess(tried))
+        kept, lost, before = (found, lost, kept) if found[1] <= 0.0 else (kept, found, lost)
+        tries += 1
+
+
+def _crossing(*points: tuple[float, float]) -> float:
+    """Return where a function of log(x) is 0, by the values at `points`: below, above, and one more.
+
+    By inverse quadratic interpolation (Brent 1973, Algorithms for Minimization Without Derivatives, sec. 4.2), and by
+    the chord of the first two where that is not between them.
+    """
+    (low, below), (high, above), _ = points
+    values = [value for _, value in points]
+    if len(set(values)) == 3 and math.isfinite(sum(values)):
+        weights = [math.prod(other / (other - value) for other in values if other != value) for value in values]
+        found = sum(w * math.log(x) for w, (x, _) in zip(weights, points, strict=True))
+        if math.log(low) < found < math.log(high):
+            return math.exp(found)
+    return low * (high / low) ** (below / (below - above))
 
 
 def axis_test(plant: AxisPlant, limits: ControllerLimits, inverse: Matrix) -> StepAndLoad:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -333,14 +334,14 @@ def _riccati(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix) -> Matrix | 
     from scipy.linalg import schur, solve
 
     n = A.shape[0]
-    RB, RS = solve(R, B.T, assume_a="sym"), solve(R, S.T, assume_a="sym")
+    RB, RS = np.hsplit(solve(R, np.hstack([B.T, S.T]), assume_a="sym"), [n])
     H = np.block([[A - B @ RS, -B @ RB], [-Q + S @ RS, -(A - B @ RS).T]])
-    values = np.linalg.eigvals(H)
-    if np.abs(values.real).min(initial=np.inf) <= _ON_AXIS * max(1.0, np.abs(values).max(initial=0.0)):
-        return None
     ordered: Any = schur(H, output="real", sort="lhp")
-    _, U, stable = ordered
-    if stable != n:
+    T, U, stable = ordered
+    # Real parts are on the diagonal, imaginary parts of a pair the root of -T[k, k+1] T[k+1, k].
+    real = np.abs(np.diag(T))
+    largest = float(real.max(initial=0.0)) + math.sqrt(float(-(np.diag(T, 1) * np.diag(T, -1)).min(initial=0.0)))
+    if stable != n or real.min(initial=np.inf) <= _ON_AXIS * max(1.0, largest):
         return None
     try:
         X = np.linalg.solve(U[:n, :n].T, U[n:, :n].T).T
