@@ -8,7 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import control
+import numba
 import pytest
+from numba.core.types import Function
+from numba.core.types.functions import BaseFunction
 
 from softneck.core import DataError, Vector
 from softneck.design import PiSettings
@@ -24,7 +27,7 @@ from softneck.loop import (
 )
 from softneck.loop._faults import FAULT_KINDS, make_fault
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.runtime import Block, _compile
+from softneck.runtime import Block, _compile, _numba_inner
 
 _KEYS: dict[str, dict[str, Any]] = {
     "sensor_bias": {"size_deg": 2.0}, "sensor_outlier": {"size_deg": 5.0, "share": 0.2, "seed": 3},
@@ -161,3 +164,34 @@ def test_a_step_that_the_rows_compile_first_may_allocate(tmp_path: Path, monkeyp
     rows.step = steps.step  # pyright: ignore[reportAttributeAccessIssue]
     _compile._compile(rows, ("rows",), {"_nrt": False})
     assert rows.rows(7) == 7
+
+
+def test_numba_resolves_each_call_once_for_our_functions_and_as_ever_for_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual, resolved = BaseFunction.get_call_type, list[tuple]()
+
+    def counted(function: Any, context: Any, args: Any, kws: Any) -> Any:
+        resolved.append((function, args))
+        return usual(function, context, args, kws)
+
+    monkeypatch.setattr(_compile, "_cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(_numba_inner, "_CALLS", {})
+    monkeypatch.setattr(BaseFunction, "get_call_type", counted)
+    text = "def inner(x, y):\n    return x * y * x\n\ndef power(x, y):\n    return inner(x, y) * x * y * x * y\n"
+    made = _compile._import_text(text, compiled=True)
+    _compile._compile(made, ("power",))
+    # A whole number stays one, beside the float of the same name.
+    assert [made.power(2.0, 3), made.power(2, 3)] == [432.0, 432]
+    assert isinstance(made.power(2, 3), int)
+    # Once for inner functions and once for those that Python calls, which have other flags.
+    assert {resolved.count(call) for call in resolved} <= {1, 2}
+    assert resolved
+    made = _compile._import_text("def lost(x):\n    return x * None\n", compiled=True)
+    _compile._compile(made, ("lost",))
+    with pytest.raises(numba.TypingError):
+        made.lost(2.0)
+    assert "get_call_type" not in vars(Function)
+    count = len(resolved)
+    assert numba.njit(lambda x, y: x * y * x * y)(2.0, 3.0) == 36.0
+    assert len(resolved) >= count + 3
