@@ -79,9 +79,15 @@ class Forked:
         self.wait(timeout)
         return self.stdout.read(), b"".join(self._error)
 
+    @property
+    def pid(self) -> int:
+        """Its number among the machine's processes."""
+        return self.process.pid or 0
+
     def send_signal(self, number: int) -> None:
-        """Send a signal."""
-        os.kill(self.process.pid or 0, number)
+        """Send a signal, unless it has ended."""
+        if self.poll() is None:
+            os.kill(self.pid, number)
 
     def kill(self) -> None:
         """End it at once."""

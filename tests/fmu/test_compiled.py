@@ -39,7 +39,13 @@ def _state(fmu: Any) -> bytes:
     return bytes(fmu.fmu.serializeFMUstate(fmu.fmu.getFMUstate()))
 
 
-@pytest.mark.parametrize("kind", slow_but(KINDS, [*SHORT, "nn"]))
+# Compiling these takes minutes in all; the runtimes of controllers and observers are compared without drives, too.
+LONG = [
+    "nonlinear", "nonlinear_payload", "guarded", "mpc", "nmpc", "adaptive", "hinf", "pid", "fopi", "lqg", "custom",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", slow_but(KINDS, [*SHORT, "nn"], nightly=LONG))
 def test_compiled_and_plain_steps_agree(
     kind: str, tmp_path: Path, running: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -176,7 +176,7 @@ def _sensitive(kind: str) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sensitivities", [False, True])
+@pytest.mark.parametrize("sensitivities", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_hostile_files_and_states_break_nothing_under_the_sanitizers(sensitivities: bool, tmp_path: Path) -> None:
     """Every kind, unchanged first: no memory asked for in a step; then with wrong bytes (SOFTNECK_FUZZ_ROUNDS each)."""
     _write_sources(tmp_path, c_sources(sensitivities=sensitivities))
