@@ -388,18 +388,21 @@ class HinfSettings(AxisSettings):
         require_between("control_weight", self.control_weight, 1e-3, 100.0)
 
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
+        import control
+
+        G: Any = control.ss(axis.nominal.tf(extra_delay=self.extra_delay) / axis.nominal.static_gain)
         if self.bandwidth is not None:
-            return self._design_at(axis, self.bandwidth)
+            return self._design_at(axis, G, self.bandwidth)
         lag = axis.nominal.time_constant + axis.nominal.delay * axis.sample_time
         return self._fastest(
-            lambda speed: self._design_at(axis, speed), axis, low=0.05 / lag, high=5.0 / lag, what="bandwidth"
+            lambda speed: self._design_at(axis, G, speed), axis, low=0.05 / lag, high=5.0 / lag, what="bandwidth"
         )
 
-    def _design_at(self, axis: UncertainAxis, bandwidth: float) -> AxisDesign:
+    def _design_at(self, axis: UncertainAxis, G: control.StateSpace, bandwidth: float) -> AxisDesign:
+        """Return the design on G, the nominal plant over its static gain."""
         import control
 
         gain, dt = axis.nominal.static_gain, axis.sample_time
-        G = axis.nominal.tf(extra_delay=self.extra_delay) / gain
         W1 = makeweight(_W1_STATIC_GAIN, bandwidth, 1.0 / _HIGH_FREQUENCY_BOUND, dt=dt)
         found = mixsyn(G, W1, self.control_weight)
         K: Any = with_integrator(found.controller)
