@@ -558,6 +558,22 @@ def test_the_best_linear_fit_is_of_each_output_on_its_own_rows() -> None:
         assert [value is not None for value in _baselines._fits(X, few)] == [known] * 2
 
 
+def test_each_horizon_has_its_own_best_linear_fit_in_whatever_order_they_are_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = neck_recording(400)
+    # Of two columns: all of them have a hundred and take seconds.
+    monkeypatch.setattr(_baselines, "_response_columns", lambda u, _: u[:, :2])
+    monkeypatch.setattr(_baselines, "_decay_columns", lambda *_: np.zeros((400, 0)))
+    segments: Any = [SimpleNamespace(recording=run)]
+    rows: Any = SimpleNamespace(robot=run.robot, measured=run.outputs, outputs_at=lambda _: run.outputs)
+    alone = [_baselines.best_linear(segments, rows, [horizon])[0] for horizon in (None, 1, 5)]
+    assert _baselines.best_linear(segments, rows, [None, 1, 5]) == alone
+    assert _baselines.best_linear(segments, rows, [5, 1, None]) == alone[::-1]
+    # What was measured a sample before tells more than the set-points alone.
+    assert all(one >= five >= free for free, one, five in zip(*alone, strict=True))
+
+
 def test_a_start_that_decays_as_slowly_as_0_1_to_6_4_scaled_seconds_is_met_in_every_segment() -> None:
     """Seven time constants, an octave apart; one less would blame a model for the state that a segment begins in."""
     part: Any = SimpleNamespace(recording=np.zeros(400))
