@@ -32,7 +32,7 @@ from softneck.tuning._judge import (
 from softneck.tuning._requirements import make_tune_requirements
 from softneck.tuning._search import Candidate, Search, ratio
 from softneck.tuning._space import COSTLY
-from softneck.tuning._task import Job, Judgement, circle_angles
+from softneck.tuning._task import Job, Judgement, Task, circle_angles
 from softneck.tuning._tune import front
 from softneck.verification import LARGE, SMALL, Scale, metric_names
 from softneck.verification._linear import AxisMargins
@@ -523,6 +523,18 @@ def test_linear_curves_are_of_the_first_output_with_the_nominal_plant_last(monke
     assert found["reference"] == [15.0]
 
 
+@pytest.mark.parametrize("drawn", [(), ("f, draw 1",)])
+@pytest.mark.parametrize("measured", [[], [False], [True], [False, True], [True, False], [True, True]])
+def test_one_family_that_was_tested_against_its_recordings_is_enough(
+    drawn: tuple[str, ...], measured: list[bool]
+) -> None:
+    linear: dict[str, Any] = {
+        str(k): SimpleNamespace(measured={"pitch": 1} if one else {}) for k, one in enumerate(measured)
+    }
+    task: Any = SimpleNamespace(drawn=drawn, linear={"model": object(), **linear})
+    assert Task.tested.fget(task) is (any(measured) and not drawn)  # pyright: ignore[reportOptionalCall]
+
+
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("own", [True, False])
 def test_each_level_computes_its_own_and_an_error_of_a_design_is_told(
@@ -996,6 +1008,7 @@ def test_where_the_best_fails_in_more_the_best_of_another_kind_is_verified_and_r
     assert made == [("lqg", False, 2), ("lqg", True, 3)]
     assert (found.best, found.controller.kind, found.observed) == (items[2], "lqg", True)
     assert relaxed(monkeypatch, items, {}, 1)[1] == [("lqg", False, 2), ("lqg", True, 3)]
+    assert relaxed(monkeypatch, items, {}, 2)[1] == [("lqg", False, 3), ("lqg", True, 4)]
     assert relaxed(monkeypatch, items, {}, 3)[1] == []
     # One that fails in its margins in the search is left out.
     poor = rising("lqg")

@@ -109,6 +109,18 @@ def test_no_row_that_was_measured_vanishes(name: str, row: int) -> None:
     assert math.isnan(score(nothing, yhat[:, 0]))
 
 
+@pytest.mark.parametrize(("unit", "shown"), [("rad", 1.0), ("deg", 180.0 / math.pi), ("mm", 1e3), ("m", 1.0)])
+def test_errors_are_told_in_the_unit_that_outputs_are_shown_in(unit: str, shown: float) -> None:
+    si = "rad" if unit in ("rad", "deg") else "m"
+    robot = Robot.from_dict({
+        "name": "cart", "directions": {"kind": "matrix", "matrix": [[1.0]]},
+        "motors": {"names": ["drive"], "unit": "V"},
+        "outputs": {"names": ["place"], "unit": si, "display_unit": unit},
+    })  # fmt: skip
+    rows = replace(rows_of(np.zeros((4, 1))), robot=robot)
+    assert rows.to_display_unit(0.25) == pytest.approx(0.25 * shown, rel=1e-12)
+
+
 def test_a_fit_is_relative_to_the_signal_and_of_its_own_mean() -> None:
     y, yhat = signals()
     for k in (0, 1):
