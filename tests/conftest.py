@@ -19,6 +19,7 @@ from softneck.identification import (
     Rls,
     SetMembership,
 )
+from softneck.runtime import _compile
 from softneck.signals import Recording
 
 from .browser import chromium_path, started
@@ -66,6 +67,14 @@ def models() -> dict[str, Model]:
         "greybox": GreyBox(evaluations=4, sensor_delay=2, body="all").fit(recording),
     }
     return {**made, "guarded": guarded_of([made["rls"], made["play"], made["nn"]], recording)}
+
+
+@pytest.fixture
+def plain_steps_of_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a test of few samples run plain Python: compiling what no other test runs takes seconds."""
+    for name in ("_runtime", "_tangent"):
+        made = getattr(_compile, name)
+        monkeypatch.setattr(_compile, name, lambda module, _compiled, made=made: made(module, False))
 
 
 @pytest.fixture(scope="session")

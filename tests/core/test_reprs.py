@@ -27,6 +27,7 @@ def test_whatever_holds_arrays_or_many_things_has_a_short_repr() -> None:
 
 
 @pytest.mark.parametrize("kind", ["pi", "mpc"])
+@pytest.mark.usefixtures("plain_steps_of_blocks")
 def test_a_controller_fits_three_lines(kind: str) -> None:
     from softneck.design import design_controller
 

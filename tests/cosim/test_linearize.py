@@ -25,6 +25,7 @@ from softneck.signals import redefinition_matrix
 from ..data import ROOT
 from ._foreign import build_foreign
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
 GOLDEN = ROOT / "tests" / "golden"
 TS = 0.02
 FREQUENCIES = np.array([0.1, 1.0, 5.0, 30.0])

@@ -30,6 +30,7 @@ from softneck.signals import redefinition_matrix, signal
 
 from ..oracles.bake_off import bake_off_plant, exact
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
 TS = 0.02
 NECK = Robot.preset()
 SIZES = [(2, 2), (3, 2), (4, 3), (3, 1)]
@@ -100,11 +101,7 @@ def test_plants_that_are_not_coupled_get_what_each_axis_gets() -> None:
 
 
 @pytest.mark.parametrize(("inputs", "outputs"), SIZES)
-@pytest.mark.parametrize(
-    "settings",
-    [LqgSettings(), pytest.param(MpcSettings(bandwidth=4.0), marks=pytest.mark.slow)],
-    ids=["lqg", "mpc"],
-)
+@pytest.mark.parametrize("settings", [LqgSettings(), MpcSettings(bandwidth=4.0)], ids=["lqg", "mpc"])
 def test_references_are_reached_on_the_plant_itself(settings: Any, inputs: int, outputs: int, tmp_path: Path) -> None:
     G: Any = plant(inputs, outputs, seed=1)
     G = control.StateSpace(G.A, G.B, G.C, G.D, TS, inputs=[f"p{j}" for j in range(inputs)],

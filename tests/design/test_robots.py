@@ -315,6 +315,7 @@ def test_an_adaptive_controller_does_the_same_in_all_units() -> None:
     assert abs(few["pitch"][-1] - math.radians(6.0)) < math.radians(0.05)
 
 
+@pytest.mark.usefixtures("plain_steps_of_blocks")
 def test_an_adaptive_controller_learns_what_its_robot_is() -> None:
     robot = Robot.preset("trunk4")
     controller = design_controller("adaptive", plant(robot))

@@ -247,6 +247,7 @@ def test_it_is_an_observer_of_a_loop(play: Model, training: Recording) -> None:
     assert np.isfinite(result["pitch_estimate"]).all()
 
 
+@pytest.mark.usefixtures("plain_steps_of_blocks")
 def test_another_robot_gives_its_sensor_and_units() -> None:
     robot = Robot.preset("antagonist")
     log = record(signal("eq22", duration=20.0, robot=robot), VirtualNeck(NeckParameters.preset("paper"), robot), seed=1)

@@ -13,6 +13,7 @@ from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ..data import ROOT, slow_but
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
 MOTORS = ["motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3"]
 
 

@@ -78,6 +78,7 @@ def check(found: Matrix, plain: Matrix, near: float) -> None:
         for view in views
     ],
 )
+@pytest.mark.usefixtures("plain_steps_of_blocks")
 def test_mpc_is_the_same(name: str, view: View) -> None:
     # The solver ends at 1e-10 of a motor's range; a loop adds up some of its roundings.
     check(mpc(world(name, view)), mpc(world(name)), 1e-7)
