@@ -135,6 +135,7 @@ def answers(controller: NmpcController, p: NonlinearProblem, a: Asked, z: np.nda
 
 
 # Derivatives by differences and another solver: nothing of what the controller computes with.
+@pytest.mark.usefixtures("plain_steps_of_blocks")
 @pytest.mark.parametrize("kind", slow_but(["nn", "play"], ["nn"]))
 @pytest.mark.parametrize("angle_limit", slow_but([None, 0.1], [0.1]))
 def test_each_sample_is_the_quadratic_program_of_differences(

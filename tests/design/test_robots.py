@@ -86,6 +86,7 @@ def test_every_linear_kind_is_designed_for_other_robots(kind: str, tmp_path: Pat
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.usefixtures("plain_steps_of_blocks")
 def test_an_antagonist_follows_a_step_and_its_tendons_share_the_pull() -> None:
     model = plant(Robot.preset("antagonist"))
     result = closed(model, design_controller("pi", model), pitch_deg=6.0, cocontraction_rad=0.3)
@@ -231,7 +232,7 @@ def test_a_predictive_controller_looks_as_far_as_its_robot_is_slow(sample_time: 
     assert (given.horizon, given.moves) == (20, 5)
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("plain_steps_of_blocks")
 def test_a_predictive_controller_does_the_same_in_all_units(tmp_path: Path) -> None:
     """It settles within the motors' range and rate, after a file as before, and so do gains ten thousand times less."""
     wide = Robot.from_dict({
@@ -297,6 +298,7 @@ def test_a_predictive_controller_over_the_virtual_plant(name: str) -> None:
         assert np.abs(P @ np.array([1.0, -1.0, 1.0, -1.0])).max() < 0.05
 
 
+@pytest.mark.usefixtures("plain_steps_of_blocks")
 def test_an_adaptive_controller_does_the_same_in_all_units() -> None:
     """Gains ten thousand times smaller and motors that go further by as much: the same loop, learning included."""
     wide = Robot.from_dict({

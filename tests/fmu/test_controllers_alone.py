@@ -27,9 +27,12 @@ from ..oracles.small_blocks import GOLDEN_ROWS
 from ..oracles.small_blocks import inputs_of as golden_inputs
 from .every_kind import MOTORS, TS, block_of, plain_run
 
-pytestmark = pytest.mark.skipif(
-    shutil.which("cc") is None and not os.environ.get("CI"), reason="no C compiler here, and no library is built"
-)
+pytestmark = [
+    pytest.mark.skipif(
+        shutil.which("cc") is None and not os.environ.get("CI"), reason="no C compiler here, and no library is built"
+    ),
+    pytest.mark.usefixtures("plain_steps_of_blocks"),
+]
 # All that run as C; nonlinear predictive control is added below.
 CONTROLLERS = ("pi", "pid", "fopi", "hinf", "lqg", "custom", "adaptive", "mpc")
 POSITIONS = [f"motor_position_{j}" for j in (1, 2, 3)]

@@ -40,6 +40,7 @@ from softneck.signals import Recording
 from ..data import slow_but
 from ..design.test_robots import plant as lag
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
 TS = 0.02
 ROWS = 500
 WARM_UP = 300

@@ -1,8 +1,8 @@
 """Damage that a parser does not see: arrays of another shape, values of another type in a header.
 
 Each file of ours is changed in one place and everything around it is right. It is refused where it is opened, in one
-line, or everything that a command makes of it works. `SOFTNECK_FUZZ_INPUTS=20000` is the nightly number of headers;
-`NUMBA_BOUNDSCHECK=1` lets compiled code check each index.
+line, or everything that a command makes of it works: steps run as plain Python, which checks each index.
+`SOFTNECK_FUZZ_INPUTS=20000` is the nightly number of headers.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from softneck.fmu.describe._describe import block_and_info
 
 from ..data import ROOT
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
 FILES = sorted((ROOT / "tests" / "golden").glob("*.npz"))
 HEADERS = int(os.environ.get("SOFTNECK_FUZZ_INPUTS", "80"))
 SEED = random.SystemRandom().randrange(2**31) if HEADERS > 1000 else 20261128
@@ -92,7 +93,6 @@ FREE = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_a_file_of_before_that_tells_no_shapes_is_refused_where_an_equation_reads_its_length(
     path: Path, tmp_path: Path

@@ -48,6 +48,7 @@ def answered(seen: World, controller: Any) -> Matrix:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_steps_of_blocks")
 @pytest.mark.parametrize("name", ["joint", pytest.param("finger", marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("kind", _KINDS)
 def test_a_controller_is_the_same_in_every_view(name: str, kind: str) -> None:
@@ -60,6 +61,7 @@ def test_a_controller_is_the_same_in_every_view(name: str, kind: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_steps_of_blocks")
 @pytest.mark.parametrize("name", ["finger", "joint"])
 def test_a_controller_of_ones_own_is_the_same_in_other_units_and_at_another_pace(name: str) -> None:
     def custom(view: View) -> Matrix:
