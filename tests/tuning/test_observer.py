@@ -60,7 +60,7 @@ def test_a_planner_takes_the_observers_lead_and_payload_into_its_design(task: Ta
     assert found.design["settings"]["payload_tautness"] == MpcSettings().over(task.observer).payload_tautness
 
 
-@pytest.mark.parametrize("kind", ["pi", "mpc"])
+@pytest.mark.parametrize("kind", ["pi", pytest.param("mpc", marks=pytest.mark.slow)])
 def test_loops_have_the_observer_that_their_kind_is_designed_for(task: Task, kind: str) -> None:
     case, block = Case(0, 1.0), controller(task, kind).block()
     loop = loop_of(case, prepare(task).own[0], block, "sequential", task, make_observer(task, kind))
