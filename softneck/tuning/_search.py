@@ -131,6 +131,7 @@ class Search:
 
     `task`: what is tuned. `spaces`: of the kinds. `crew`: workers. `log`: of judgements. `budget`: of judgements.
     `report`: called with progress and the best so far. `finals`: number of final candidates with margins by experiment.
+    `earlier`: number of judgements of the search that this one resumes.
     """
 
     task: Task
@@ -143,12 +144,17 @@ class Search:
     candidates: dict[tuple[str, str], Candidate] = field(default_factory=dict)
     spent: set[Job] = field(default_factory=set)
     dropped: dict[str, str] = field(default_factory=dict)
+    earlier: int = 0
+
+    @property
+    def levels(self) -> Sequence[str]:
+        """The levels of all candidates; margins by experiment, and other loops, need simulation models."""
+        return LEVELS[:-1] if self.task.own else LEVELS[:1]
 
     def run(self) -> None:
         """Search until the budget is spent."""
         optimisers = {space.kind: _optimiser(space, self.task.seed, i) for i, space in enumerate(self.spaces)}
-        # Margins by experiment need simulation models.
-        levels = LEVELS[:-1] if self.task.own else LEVELS[:1]
+        levels = self.levels
         # A small budget goes to the starts first.
         finals = min(self.finals, max(0, self.budget - len(levels) * len(self.spaces))) if self.task.own else 0
         alive, before = self._judge_starts(levels, finals, optimisers), -1
@@ -159,9 +165,21 @@ class Search:
             for space in alive:
                 _tell(optimisers[space.kind], generation[space.kind], self._rank)
             alive = self._drop_kinds(alive)
-        self._refine(levels, finals)
+        self._finish(finals)
+
+    def resume(self, starts: Sequence[Candidate]) -> None:
+        """Judge candidates of a search over fewer plants, and search near the best until the budget is spent."""
+        finals = min(self.finals, max(0, self.budget - len(self.levels) * len(starts)))
+        spaces = {space.kind: space for space in self.spaces}
+        self._judge_levels([self._candidate(spaces[item.kind], item.x) for item in starts], self.levels, finals)
+        self._finish(finals)
+
+    def _finish(self, finals: int) -> None:
+        """Search near the best, and judge the margins of the final candidates by experiment."""
+        self._refine(self.levels, finals)
         if finals:
-            self._judge([item for item in self.sort_candidates() if item.level == levels[-1]][:finals], "margins", 0)
+            last = [item for item in self.sort_candidates() if item.level == self.levels[-1]]
+            self._judge(last[:finals], "margins", 0)
 
     def sort_candidates(self) -> list[Candidate]:
         """Return all candidates with metrics, the best first."""

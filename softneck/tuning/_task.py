@@ -41,6 +41,13 @@ def has_observer(kind: str) -> bool:
     return hasattr(resolve(KINDS[kind].settings), "over")
 
 
+def _closer(item: Requirement, kept: float) -> Requirement:
+    """Return a requirement whose limit is closer, unless nothing could meet it."""
+    if item.bound == "min":
+        return replace(item, limit=item.limit + kept)
+    return replace(item, limit=item.limit - kept) if item.limit > kept else item
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Task:
     """Data that a worker needs to judge a candidate.
@@ -78,12 +85,8 @@ class Task:
 
     @property
     def aims(self) -> tuple[Requirement, ...]:
-        """Requirements of the search, less what it stays below them for draws that it does not see."""
-        kept = self.asked.kept
-        return tuple(
-            replace(item, limit=item.limit - kept[item.metric])
-            if item.bound == "max" and item.limit > kept.get(item.metric, math.inf) else item for item in self.bounds
-        )  # fmt: skip
+        """Requirements of the search: closer by what it keeps for draws that it does not see."""
+        return tuple(_closer(item, self.asked.kept.get(item.metric, 0.0)) for item in self.bounds)
 
     @property
     def said_cocontraction(self) -> float | None:

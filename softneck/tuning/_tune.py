@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -63,8 +65,11 @@ BUDGET = 160
 _SEARCHED_DRAWS = 2
 # Number of the best candidates that are verified until one holds.
 _MAX_VERIFICATIONS = 2
-# Number of all verifications: a family has draws for so many.
-_MAX_ATTEMPTS = 4
+# Number of all verifications, if a family has draws for so many.
+_MAX_ATTEMPTS = 6
+# Where a certificate fails: the number of its draws that join the search, of candidates with which it resumes, and its
+# share of the budget.
+_MORE_DRAWS, _RESUMED, _RESUMED_SHARE = 2, 6, 0.4
 _UNCERTIFIED_REASON = "beside recordings nothing is certified of it; name it in --kinds to search it all the same"
 # Smaller co-contractions, of a neck, set no rule.
 _MIN_COCONTRACTION_RAD = 0.05
@@ -188,7 +193,8 @@ def tune(
             search = Search(task, each, members, log, budget, lambda done, text: tell(0.9 * done, text))
             search.dropped |= dropped
             search.run()
-        return _make_result(search, files, lambda done, text: tell(0.9 + 0.1 * done, text))
+            search, certified, tried = _certify_search(search, files, lambda done, text: tell(0.9 + 0.1 * done, text))
+        return _make_result(search, certified, tried, files, lambda done, text: tell(0.9 + 0.1 * done, text))
 
 
 def task_of(plants: Any, requirements: TuneRequirements | Mapping[str, Any] | str | Path | None, seed: int) -> Task:
@@ -249,16 +255,59 @@ def _target_rise(task: Task) -> float:
     return USUAL_RISE / min(float(box.nominal[1]) for box in source.axes)
 
 
-def _make_result(search: Search, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
-    """Verify the best candidate and return the result of a search."""
-    task, ranked = search.task, search.sort_candidates()
-    if not ranked:
-        why = "; ".join(f"{kind}: {text}" for kind, text in search.dropped.items())
-        if any(space.kind not in search.dropped for space in search.spaces):
-            raise CheckFailedError(f"the budget ended before any candidate was judged ({why}); increase it.")
-        raise SettingsError(f"no candidate controller could be designed ({why}).")
-    compared = [item for item in ranked if LEVELS.index(item.level) >= 1] or ranked
-    certified, tried = _verify_best(search, compared, files, progress)
+def _certify_search(
+    search: Search, files: Mapping[str, tuple[str, str]] | None, progress: Progress
+) -> tuple[Search, _Certified, int]:
+    """Return a search that ended, its certified best and the number of verifications.
+
+    Where draws of the certificate fail, the worst of them join the plants and the search resumes from its best.
+    """
+    certified, tried = _verify_best(search, 0, files, progress)
+    failing = {} if certified.verification.holds else _failing_draws(certified.verification)
+    if not failing or tried >= _most_attempts(search.task):
+        return search, certified, tried
+    task = search.task
+    digest = hashlib.sha256("\n".join([task.digest, *failing]).encode()).hexdigest()
+    more = replace(task, own={**task.own, **failing}, drawn=(*task.drawn, *failing), digest=digest)
+    prepare(more)
+    again = replace(
+        search, task=more, log=Log(None, digest), budget=round(_RESUMED_SHARE * search.budget), candidates={},
+        spent=set(), earlier=len(search.spent),
+    )  # fmt: skip
+    again.resume(_best_of_kinds(search.sort_candidates())[:_RESUMED])
+    if not again.sort_candidates():
+        return search, certified, tried
+    return again, *_verify_best(again, tried, files, progress)
+
+
+def _best_of_kinds(ranked: Sequence[Candidate]) -> list[Candidate]:
+    """Return candidates, the best of each kind first."""
+    first = {item.kind: item for item in reversed(ranked)}
+    return [*sorted(first.values(), key=ranked.index), *(item for item in ranked if item is not first[item.kind])]
+
+
+def _failing_draws(verification: Verification) -> dict[str, Any]:
+    """Return name -> the draws of a certificate with the worst values of what fails."""
+    found = {}
+    for part, verdict in product(verification.evidence.drawn, verification.failed):
+        bound = verdict.requirement
+        model = part.worst(bound.metric, largest=bound.bound != "min")
+        if model is not None:
+            found.setdefault(id(model.arrays), (f"{part.family}, attempt {part.attempt}, {bound.metric}", model))
+    return dict(list(found.values())[:_MORE_DRAWS])
+
+
+def _most_attempts(task: Task) -> int:
+    """Return the number of certificates that the draws of all families allow."""
+    drawn = [thing.draws for thing in task.linear.values() if getattr(thing, "draws", None) is not None]
+    return min([_MAX_ATTEMPTS, *(draws.attempts for draws in drawn)])
+
+
+def _make_result(
+    search: Search, certified: _Certified, tried: int, files: Mapping[str, tuple[str, str]] | None, progress: Progress
+) -> Tuned:
+    """Return the result of a search; where its best does not hold, relax defaults."""
+    task, compared = search.task, _compared(search)
     best, verification = certified.item, certified.verification
     bounds = task.bounds
     names = objectives(compared)
@@ -277,9 +326,20 @@ def _make_result(search: Search, files: Mapping[str, tuple[str, str]] | None, pr
         best=best, controller=certified.controller, observer=task.observer, observed=certified.observed,
         assumed=_assumed(certified.controller), own=prepare(task).own, verification=verification, holds=holds,
         candidates=compared, front=front(compared, names), objectives=names, binding=stuck, nearest=nearest,
-        evaluations=len(search.spent), dropped=search.dropped, task=task,
+        evaluations=search.earlier + len(search.spent), dropped=search.dropped, task=task,
     )  # fmt: skip
     return found if holds or not closed else _relax(found, tried, files, progress)
+
+
+def _compared(search: Search) -> list[Candidate]:
+    """Return the candidates that loops have judged, else all, the best first."""
+    ranked = search.sort_candidates()
+    if not ranked:
+        why = "; ".join(f"{kind}: {text}" for kind, text in search.dropped.items())
+        if any(space.kind not in search.dropped for space in search.spaces):
+            raise CheckFailedError(f"the budget ended before any candidate was judged ({why}); increase it.")
+        raise SettingsError(f"no candidate controller could be designed ({why}).")
+    return [item for item in ranked if LEVELS.index(item.level) >= 1] or ranked
 
 
 def _relax(found: Tuned, tried: int, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
@@ -288,25 +348,25 @@ def _relax(found: Tuned, tried: int, files: Mapping[str, tuple[str, str]] | None
     Candidates are the best, then the best of each other kind that the search has failed in nothing else. Stated
     requirements and stability margins are not relaxed. Each verification has draws that none of the `tried` has seen.
     """
-    task = found.task
+    task, most = found.task, _most_attempts(found.task)
     best = _Certified(found.best, found.controller, found.observed, found.verification)
     for item in _relaxable(found):
         certified = best
         if item is not found.best:
-            if tried + 2 > _MAX_ATTEMPTS:
+            if tried + 2 > most:
                 break
             tried += 1
             progress(0.9, f"verify {item.kind}")
             certified = _certify(task, item, files, tried)
         kept = relaxations(item, certified.verification.failed, task.asked)
         asked = task.asked
+        if item is found.best and (not kept or tried >= most):
+            continue
         if kept:
             tried += 1
             progress(0.9, "verify what holds")
             asked = relax_limits(asked, {metric: one.limit for metric, one in kept.items()})
             certified = _certify_again(replace(task, asked=asked), certified, files, tried)
-        elif item is found.best:
-            continue
         if certified.verification.holds:
             return replace(
                 found, best=item, controller=certified.controller, observed=certified.observed, loosened=kept,
@@ -349,17 +409,19 @@ class _Certified:
 
 
 def _verify_best(
-    search: Search, compared: Sequence[Candidate], files: Mapping[str, tuple[str, str]] | None, progress: Progress
+    search: Search, tried: int, files: Mapping[str, tuple[str, str]] | None, progress: Progress
 ) -> tuple[_Certified, int]:
-    """Return the first of the best whose certificate holds, else the best, and the number of verifications."""
-    found: list[_Certified] = []
+    """Return the first of the best whose certificate holds, else the best, and the number of verifications so far."""
+    compared, found = _compared(search), []
     promising = [item for item in compared if search.cost(item) <= 1.0][:_MAX_VERIFICATIONS] or compared[:1]
-    for number, item in enumerate(promising):
-        progress(number / len(promising), f"verify {item.kind}")
-        found.append(_certify(search.task, item, files, number + 1))
+    for number, item in enumerate(promising, start=tried + 1):
+        if number > _most_attempts(search.task):
+            break
+        progress((number - tried - 1) / len(promising), f"verify {item.kind}")
+        found.append(_certify(search.task, item, files, number))
         if found[-1].verification.holds:
-            return found[-1], number + 1
-    return found[0], len(promising)
+            return found[-1], number
+    return found[0], tried + len(found)
 
 
 def _certify(task: Task, item: Candidate, files: Mapping[str, tuple[str, str]] | None, attempt: int) -> _Certified:

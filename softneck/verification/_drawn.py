@@ -19,7 +19,7 @@ import numpy as np
 
 from softneck.core import DataError, Progress, Vector, compute_once
 from softneck.estimation import directions_of
-from softneck.identification import Draws
+from softneck.identification import Draws, Model
 from softneck.loop import BlockPart, Loop, LoopResult, MotorFault, RobotReference, error_unit, run_loop
 from softneck.runtime import Block
 
@@ -79,6 +79,14 @@ class Drawn:
     def content(self) -> float:
         """Share of such plants that holds with 95 % confidence; 0 if a draw fails."""
         return 0.0 if self.failed else certified_content(self.count, self.attempt)
+
+    def worst(self, metric: str, *, largest: bool) -> Model | None:
+        """Return the draw with the worst value of a metric; None if no loop tells it."""
+        if metric not in self.values:
+            return None
+        values = np.nan_to_num(self.values[metric], nan=math.inf if largest else -math.inf)
+        row = int(np.argmax(values) if largest else np.argmin(values))
+        return self.draws.for_certificate(self.attempt)[self.conditions[metric][row]["draw"]]
 
     def statement(self) -> str:
         """Return what the loops over the draws say."""
@@ -189,7 +197,9 @@ def _run_all(
             bounds = [item for item in asked.bounds if item.metric == metric]
             for value, condition in found:
                 values.setdefault(metric, []).append(value)
-                conditions.setdefault(metric, []).append({"name": f"{plants[number].name}, {condition}"})
+                conditions.setdefault(metric, []).append(
+                    {"name": f"{plants[number].name}, {condition}", "draw": number}
+                )
                 if not all(item.holds(value) for item in bounds):
                     failed.add(number)
     # A gain raised and one lowered are two margins: the slow loop of a lower gain swings longer, and may never fail.
@@ -402,7 +412,7 @@ def _margin_facts(item: _Margin, name: str, asked: Requirements) -> dict[str, An
     per = math.radians(1.0) if factor is None else factor
     case = item.experiment
     return {
-        "name": name, "axis": case.axes, "raised": case.what, f"kick_{unit}": case.amplitude / per,
+        "name": name, "draw": item.number, "axis": case.axes, "raised": case.what, f"kick_{unit}": case.amplitude / per,
         f"posture_{unit}": [x / per for x in case.posture], "worst_of": _BISECTED,
     }  # fmt: skip
 

@@ -856,7 +856,9 @@ def test_the_first_whose_certificate_holds_is_taken_and_else_the_best(
     items = [replace(item, settings={"k": round(0.1 * (k + 1), 1)}) for k, item in enumerate(items)]
     search = searching()
     most = _tune._MAX_VERIFICATIONS
-    found, count = _tune._verify_best(search, items, None, lambda *_: None)
+    monkeypatch.setattr(Search, "sort_candidates", lambda _: items)
+    monkeypatch.setattr(_tune, "_most_attempts", lambda _: 3)
+    found, count = _tune._verify_best(search, 0, None, lambda *_: None)
     verification: Any = found.verification
     first = next((k for k, held in enumerate(holds[:most]) if held), None)
     assert found.item is items[first or 0]
@@ -865,10 +867,94 @@ def test_the_first_whose_certificate_holds_is_taken_and_else_the_best(
     # Each attempt at a certificate has a number of its own: its draws are none that another has seen.
     assert tried == list(range(1, (min(len(holds), most) if first is None else first + 1) + 1))
     assert count == len(tried)
-    # If none holds in the search, the best alone is verified.
+    # If none holds in the search, the best alone is verified; draws that another search had are not drawn again.
     tried.clear()
-    assert _tune._verify_best(search, items[-1:] * 2, None, lambda *_: None)[0].item is items[-1]
+    monkeypatch.setattr(Search, "sort_candidates", lambda _: items[-1:] * 2)
+    assert _tune._verify_best(search, 0, None, lambda *_: None)[0].item is items[-1]
     assert tried == [1]
+    monkeypatch.setattr(Search, "sort_candidates", lambda _: [items[0]] * 2)
+    monkeypatch.setattr(_tune, "_verify_loop", lambda *rest: tried.append(rest[-1]) or SimpleNamespace(holds=False))
+    assert _tune._verify_best(search, 2, None, lambda *_: None)[1] == 3
+    assert tried == [1, 3]
+
+
+class _Resumed(Search):
+    """A search that records what it resumes with, and finds one candidate."""
+
+    def resume(self, starts: Any) -> None:
+        self.starts = [(item.kind, item.metrics["m"]) for item in starts]
+        if self.task.seed == 0:
+            self.candidates["b", ""] = of_kind("b", 0.2)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_draws_that_fail_a_certificate_join_the_plants_of_a_search_that_resumes(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @dataclass(frozen=True)
+    class Plants:
+        digest: str = "d"
+        own: Any = None
+        drawn: Any = ("draw",)
+        seed: int = 0
+        bounds: Any = (Requirement("m", "max", 1.0, True),)
+        aims: Any = bounds
+        tested: bool = False
+        linear: Any = None
+
+    task: Any = Plants(own={"p": 1, "draw": 2}, seed=seed, linear={})
+    search: Any = _Resumed(task, searching("ab").spaces, None, None, 40, lambda *_: None)  # pyright: ignore[reportArgumentType]
+    search.candidates = {(kind, str(m)): of_kind(kind, m) for kind, m in (("a", 0.1), ("a", 0.3), ("b", 0.5))}
+    search.spent = {1, 2, 3}
+    # Of three requirements two fail by one draw, the third by another; what no loop tells has none.
+    low, high = SimpleNamespace(arrays=[1]), SimpleNamespace(arrays=[2])
+    worst = {"x": high, "y": high, "z": low, "w": None}
+    part = SimpleNamespace(family="f", attempt=1, worst=lambda metric, largest: worst[metric] if largest else None)
+    failed = [SimpleNamespace(requirement=Requirement(metric, "max", 1.0, True)) for metric in "wxyz"]
+    verified: list[int] = []
+
+    def certify(task: Any, item: Any, _: Any, attempt: int) -> Any:
+        verified.append(attempt)
+        holds = len(task.own) > 2
+        return _tune._Certified(item, "c", False, SimpleNamespace(  # pyright: ignore[reportArgumentType]
+            holds=holds, failed=[] if holds else failed, evidence=SimpleNamespace(drawn=[part])))  # fmt: skip
+
+    monkeypatch.setattr(_tune, "_certify", certify)
+    monkeypatch.setattr(_tune, "prepare", lambda _: None)
+    again, certified, tried = _tune._certify_search(search, None, lambda *_: None)
+    if seed:  # nothing could be designed for them: the first search stands
+        assert (again, certified.item, tried) == (search, search.sort_candidates()[0], 2)
+        return
+    assert list(again.task.own.values()) == [1, 2, high, low]
+    assert set(again.task.drawn) == {"draw", *list(again.task.own)[2:]}
+    assert again.task.digest != "d"
+    # The best of each kind comes first, and what was spent is counted.
+    assert again.starts == [("a", 0.1), ("b", 0.5), ("a", 0.3)]  # pyright: ignore[reportAttributeAccessIssue]
+    assert (again.budget, again.earlier, again.spent) == (16, 3, set())
+    assert (certified.item.metrics["m"], tried, verified) == (0.2, 3, [1, 2, 3])
+
+
+@pytest.mark.parametrize("budget", [3, 30])
+def test_a_search_that_resumes_judges_its_starts_and_neighbours_within_its_budget(
+    budget: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search, said = searching("ab", budget=budget, own={"p": 1}), []
+
+    def judge(self: Search, items: Any, level: str, reserved: int) -> None:
+        said.append((level, sorted({item.kind for item in items}), reserved))
+        for item in items:
+            item.level, item.metrics = level, {"m": float(item.x[0]), "axes.sensitivity": 1.0}
+
+    monkeypatch.setattr(Search, "_judge", judge)
+    made = {kind: of_kind(kind, 9.0) for kind in "ab"}
+    monkeypatch.setattr(
+        Search, "_candidate", lambda self, space, _: self.candidates.setdefault(space.kind, made[space.kind])
+    )
+    monkeypatch.setattr(Search, "_refine", lambda _, levels, finals: said.append(("near", list(levels), finals)))
+    search.resume([of_kind("b", 1.0), of_kind("a", 2.0)])
+    finals = 0 if budget == 3 else 3
+    begun = [(level, ["a", "b"], finals) for level in LEVELS[:-1]] + [("near", list(LEVELS[:-1]), finals)]
+    assert said == begun + [("margins", ["a", "b"], 0)] * (finals > 0)
 
 
 @pytest.mark.parametrize("observed", [True, False])
@@ -892,12 +978,12 @@ def ended(
     failed = [SimpleNamespace(value=value, requirement=bounds[0]) for holds, value in verified if not holds]
     verification = SimpleNamespace(holds=not failed, failed=failed)
     certified = _tune._Certified(best, SimpleNamespace(design={}), False, verification)  # pyright: ignore[reportArgumentType]
-    monkeypatch.setattr(_tune, "_verify_best", lambda *_: (certified, 1))
     monkeypatch.setattr(_tune, "prepare", lambda _: SimpleNamespace(own=()))
     monkeypatch.setattr(_tune, "make_observer", lambda *_: None)
     monkeypatch.setattr(_tune, "_relax", lambda found, *_: ("relaxed", found))
-    search: Any = SimpleNamespace(task=task, sort_candidates=lambda: [best], dropped={"lqg": "no"}, spent=[1, 2])
-    return _tune._make_result(search, None, lambda *_: None)
+    search: Any = SimpleNamespace(task=task, sort_candidates=lambda: [best], dropped={"lqg": "no"}, spent=[1],
+                                  earlier=1)  # fmt: skip
+    return _tune._make_result(search, certified, 1, None, lambda *_: None)
 
 
 def test_a_result_holds_where_its_certificate_its_loops_and_its_search_do(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -923,7 +1009,7 @@ def test_a_search_without_any_result_says_whether_the_budget_or_the_designs_ende
     for dropped, error in (({"pi": "x"}, CheckFailedError), ({"pi": "x", "lqg": "y"}, SettingsError)):
         search: Any = SimpleNamespace(task=task_for({}), sort_candidates=list, dropped=dropped, spaces=spaces)
         with pytest.raises(error, match="pi: x"):
-            _tune._make_result(search, None, lambda *_: None)
+            _tune._compared(search)
 
 
 def test_the_rise_that_is_aimed_at_is_the_shortest_asked_or_two_time_constants() -> None:
@@ -995,6 +1081,8 @@ def test_what_is_relaxed_is_verified_again_by_draws_of_its_own(monkeypatch: pyte
     assert found.loosened == RELAXED
     assert found.task.asked.limit("sim.rise_s") == found.verification.task.asked.limit("sim.rise_s") == 0.7
     assert relaxed(monkeypatch, [rising("pi")], {}, 2)[1] == [("pi", True, 3)]
+    monkeypatch.setattr(_tune, "_most_attempts", lambda _: 2)
+    assert relaxed(monkeypatch, [rising("pi")], {}, 2)[1] == []  # no draws are left
     # A best that fails in its margins is not verified again.
     assert relaxed(monkeypatch, [rising("pi", margins=True)], {}, 2)[1] == []
 
@@ -1003,6 +1091,7 @@ def test_where_the_best_fails_in_more_the_best_of_another_kind_is_verified_and_r
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     items = [rising("pi", margins=True), rising("pi"), rising("lqg"), rising("lqg"), rising("mpc")]
+    monkeypatch.setattr(_tune, "_most_attempts", lambda _: 4)
     found, made = relaxed(monkeypatch, items, {("lqg", True): True}, 1)
     # At what was asked first, which tells each metric that fails; never more certificates than a family has draws for.
     assert made == [("lqg", False, 2), ("lqg", True, 3)]

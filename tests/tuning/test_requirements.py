@@ -68,12 +68,14 @@ def test_a_reserve_is_taken_off_what_plants_must_keep_and_said() -> None:
 def test_where_draws_decide_the_search_alone_stays_below_the_default_limit() -> None:
     drawn, known = make_tune_requirements({}, drawn=True), make_tune_requirements({})
     assert not drawn.reserve
-    assert drawn.kept == known.reserve
+    assert drawn.kept == {**known.reserve, "axes.gain_margin": 0.4}
     assert drawn.limit("sim.overshoot_pct") == known.robot_limit("sim.overshoot_pct")
     task = task_of({"n": neck()}, {}, 0)
-    aims = {b.metric: b.limit for b in replace(task, asked=drawn).aims}
+    seen = replace(task, asked=drawn)
+    aims, limits = ({b.metric: b.limit for b in bounds} for bounds in (seen.aims, seen.bounds))
     assert aims["sim.overshoot_pct"] == pytest.approx(known.limit("sim.overshoot_pct"))
-    assert {name for name, limit in aims.items() if limit != drawn.limit(name) and drawn.limit(name)} == set(drawn.kept)
+    assert aims["axes.gain_margin"] == limits["axes.gain_margin"] + 0.4
+    assert {name for name, limit in aims.items() if limit != limits[name]} == set(drawn.kept)
     assert replace(task, asked=known).aims == replace(task, asked=known).bounds
     # A reserve of one's own is taken off all limits, as without draws; a limit below it is aimed at itself.
     own = {"reserve": {"sim.overshoot_pct": 1.0}}

@@ -193,6 +193,17 @@ def test_steps_of_margins_lie_within_the_recorded_motion(
     assert found == pytest.approx(steps, rel=1e-12)
 
 
+def test_the_worst_draw_of_a_metric_is_that_of_its_attempt() -> None:
+    draws = SimpleNamespace(for_certificate=lambda attempt: [f"attempt {attempt}, {k}" for k in range(3)])
+    values = {"m": np.array([1.0, 3.0, 2.0, 3.0]), "n": np.array([1.0, math.nan, -math.inf, 0.0])}
+    numbers = [{"draw": k} for k in (0, 2, 1, 0)]
+    found = Drawn("f", draws, 4, 3, values, dict.fromkeys("mn", numbers), ())  # pyright: ignore[reportArgumentType]
+    assert [found.worst("m", largest=True), found.worst("m", largest=False)] == ["attempt 4, 2", "attempt 4, 0"]
+    # A value that is no number is the worst of both.
+    assert found.worst("n", largest=True) == found.worst("n", largest=False) == "attempt 4, 2"
+    assert found.worst("k", largest=True) is None
+
+
 @pytest.mark.parametrize(
     ("changes", "motion", "heavy", "told"),
     [

@@ -59,8 +59,8 @@ def test_draws_follow_their_seed_and_no_two_are_the_same(made: Callable[..., Dra
     # A search, and each attempt at a certificate, have draws of their own.
     assert len(set(every)) == len(every) == _draws.SEARCH_DRAWS + _draws.ATTEMPTS * 3
     assert not set(every) & set(bits(other.for_certificate(1)))
-    with pytest.raises(SettingsError, match="has draws for 4 certificates and this is attempt 5"):
-        one.for_certificate(5)
+    with pytest.raises(SettingsError, match="has draws for 6 certificates and this is attempt 7"):
+        one.for_certificate(7)
 
 
 def test_a_factor_is_as_good_as_the_best_within_one_standard_error() -> None:
