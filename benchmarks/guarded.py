@@ -1,13 +1,11 @@
 """Print what guarded models are worth on necks that nobody tuned to: the table of docs/theory/models.md.
 
-`python benchmarks/guarded.py [--necks NECK...] [--of KIND...] [--seeds N] [--kept] [--fmu] [--auto]`
+`python benchmarks/guarded.py [--necks NECK...] [--of KIND...] [--seeds N] [--kept] [--fmu]`
 
 Trained on 140 s of Eq. 22 with the kind's defaults; judged in free run from set-points alone, worst axis: on the rows
 of Eq. 22 that follow (validation), and on steps, sine and rotation. A seed is that of noise and of starts. Results and
 models are kept in `build/guarded`: a run that was stopped goes on where it was. They are of the code that made them.
 With --fmu it prints what a `doStep` of the kept models costs as compiled FMUs, and that of a line beside them.
-With --auto it prints what `identify auto` takes on 165 s of Eq. 22 (70 % to train on) where a kind of --of is the best,
-and what its guarded form is worth.
 """
 
 from __future__ import annotations
@@ -21,11 +19,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from benchmarks.baseline import SHOWN, TESTS, recorded, records_of_tests, training
-from softneck.core import load, silent
+from softneck.core import load
 from softneck.fmu import build_compiled_fmu
 from softneck.identification import INFINITE, Model, OutputError, validate
-from softneck.identification.models._left_out import folds
-from softneck.identification.selection._auto import _Race, kinds_to_try
 from softneck.identification.uncertainty._guarded import Guarded
 from softneck.signals import Recording, signal
 from tests.foreign_necks.kept import keep, kept_lines
@@ -66,29 +62,6 @@ def table(results: dict[tuple[str, str, int], dict[str, Any]]) -> None:
         print(f"`{of}`: worst axis of the tests, median {np.median(worst):.1f}, least {min(worst):.1f} of {len(worst)}")
 
 
-def of_auto(neck: str, kinds: list[str]) -> None:
-    """Print the processor time [s] of `choose` as if each kind had won, and the worst axes of both forms."""
-    log, tests = recorded(neck, signal("eq22"), 0).rows(0, 8250), records_of_tests(neck, 0)
-    train, hold_out = log.split(0.7)
-    begin = time.process_time()
-    race = _Race(train, hold_out, folds(train, hold_out, other_excitation=False), 0)
-    for kind in kinds_to_try():
-        race.screen(kind)
-    race.examine()
-    screened = time.process_time() - begin
-    for kind in kinds:
-        begin = time.process_time()
-        race.whole(kind)
-        race.train_other(race.guarded(race.tried[kind], silent))
-        seconds = screened + time.process_time() - begin
-        models = {"guarded": race.tried["guarded"].model, "alone": race.tried[kind].model}
-        print(f"{neck} {kind}: {seconds:.1f} s of processor time, {screened:.1f} of them to compare all kinds")
-        for name, model in models.items():
-            if model is not None:
-                fits = ", ".join(f"{worst_axis(model, test):.1f}" for test in (hold_out, *tests))
-                print(f"  {name}: worst axis on the rows held out, {', '.join(TESTS)}: {fits}", flush=True)
-
-
 def do_step_us(model: Model) -> float:
     """Return the processor time of a `doStep` of the compiled FMU [us], with fmpy's call: least mean of seven."""
     import fmpy
@@ -120,13 +93,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2, help="how many (2)")
     parser.add_argument("--kept", action="store_true", help="compute nothing: print what is there")
     parser.add_argument("--fmu", action="store_true", help="compute nothing: print the time of a doStep")
-    parser.add_argument("--auto", action="store_true", help="print what `identify auto` takes and its form is worth")
     wanted = parser.parse_args()
-    for neck in wanted.necks if wanted.auto else ():
-        with threadpool_limits(1):
-            of_auto(neck, wanted.of)
-    if wanted.auto:
-        return
     if wanted.fmu:
         line = OutputError().fit(training(wanted.necks[0], 0))
         print(f"oe: {do_step_us(line):.2f} us a doStep, fmpy's call with it")
