@@ -147,7 +147,7 @@ def tune(
             objects or files.
         requirements: beside the defaults: a file, a table like one, or flat as in `{"overshoot_pct": 5}`.
         kinds: of controllers, also as "pi,mpc"; default `KINDS_SEARCHED`, beside recordings without `UNCERTIFIED`.
-        budget: number of judgements of candidates.
+        budget: number of judgements of candidates; 40 % more where draws of a family fail the certificate.
         observer: of the loop; default a Kalman filter over the nominal plant.
         seed: of the search and of the noise in its loops.
         workers: processes; default one per core, 0 for this process.
