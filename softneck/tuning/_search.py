@@ -318,12 +318,12 @@ class Search:
     def _store(self, job: Job, judgement: Judgement) -> None:
         self.log.found[job] = judgement
         self.log.write()
-        self._report_progress(len(self.spent) + 1)
+        self.spent.add(job)
+        self._report_progress()
 
-    def _report_progress(self, done: int | None = None) -> None:
-        share = min(1.0, (len(self.spent) if done is None else done) / self.budget)
+    def _report_progress(self) -> None:
         best = next(iter(self.sort_candidates()), None)
-        self.report(share, "nothing yet" if best is None else in_words(best, self.cost(best)))
+        self.report(len(self.spent) / self.budget, "nothing yet" if best is None else in_words(best, self.cost(best)))
 
 
 def run_jobs(

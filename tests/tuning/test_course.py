@@ -9,13 +9,18 @@ from typing import Any
 
 import pytest
 
+from softneck.core import DataError, SettingsError
 from softneck.cosim.studies._run_study import SameProcess, WorkerPool
+from softneck.estimation import KalmanSettings
 from softneck.robot import Robot
-from softneck.tuning import _search
+from softneck.tuning import _search, _tune, tune
 from softneck.tuning._search import Search
-from softneck.tuning._space import spaces
-from softneck.tuning._task import Judgement, Log
+from softneck.tuning._space import KINDS_SEARCHED, spaces
+from softneck.tuning._task import Judgement, Log, Task, digest_of
 from softneck.verification._requirements import Requirement
+
+from ..design.test_robots import plant
+from ..verification.necks import linear_neck
 
 BOUNDS = (
     Requirement("axes.sensitivity", "max", 2.5, False), Requirement("axes.gain_margin", "min", 2.0, False),
@@ -36,13 +41,13 @@ def judged(_: Any, kind: str, settings: Mapping[str, Any], level: str) -> Judgem
     return Judgement({"sim.rise_s": rise + 0.45 / Ms**2, "sim.overshoot_pct": 1.0 / rise})
 
 
-def searched(monkeypatch: pytest.MonkeyPatch, budget: int, tested: bool = True) -> Search:
+def searched(monkeypatch: pytest.MonkeyPatch, budget: int, tested: bool = True, tell: Any = lambda *_: None) -> Search:
     monkeypatch.setattr(_search, "judge_candidate", judged)
     task: Any = SimpleNamespace(
         asked=SimpleNamespace(bounds=BOUNDS), bounds=BOUNDS, aims=BOUNDS, own={"neck": 0}, seed=0, tested=tested,
     )  # fmt: skip
     each = spaces(("pi", "hinf"), rise=0.4, cocontraction=None, robot=Robot.preset())
-    found = Search(task, each, WorkerPool(1, SameProcess()), Log(None, ""), budget, lambda *_: None)
+    found = Search(task, each, WorkerPool(1, SameProcess()), Log(None, ""), budget, tell)
     found.run()
     return found
 
@@ -91,3 +96,119 @@ def test_a_search_ends_nearer_to_what_is_wanted_than_it_begins(monkeypatch: pyte
     assert costs[-1] < costs[0]
     # What is searched at last, near the best, is within a hundredth of where both limits are met alike: 0.98 of them.
     assert costs[-1] < 0.995
+
+
+def test_what_a_search_says_of_its_course_only_grows_and_ends_with_its_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[tuple[float, str]] = []
+    found = searched(monkeypatch, 40, tell=lambda *told: said.append(told))
+    shares = [share for share, _ in said]
+    assert shares == sorted(shares)
+    # With each judgement, also within a generation.
+    assert set(shares) == {done / 40 for done in range(1, 41)}
+    assert len(found.spent) == 40
+    assert said[0][1] == "nothing yet"
+    assert said[-1][1].startswith(f"best {found.sort_candidates()[0].kind}, rise")
+
+
+class Begun(Exception):
+    """What `tune` has made before its search."""
+
+
+def begun(monkeypatch: pytest.MonkeyPatch, plants: Any = None, **asked: Any) -> Search:
+    """Return the search that `tune` begins."""
+
+    def run(self: Search) -> None:
+        raise Begun(self)
+
+    monkeypatch.setattr(_tune, "prepare", lambda _: None)
+    monkeypatch.setattr(Search, "run", run)
+    with pytest.raises(Begun) as found:
+        tune({"n": linear_neck()} if plants is None else plants, {}, workers=0, **asked)
+    return found.value.args[0]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "searched"),
+    [("pi", ("pi",)), ("lqg,pi", ("lqg", "pi")), (["pi", "lqg"], ("pi", "lqg")), ("pi,lqg,pi", ("pi", "lqg")),
+     ("", None), ((), None)],
+)  # fmt: skip
+def test_the_kinds_that_are_named_are_searched_once_each_and_else_the_usual_ones(
+    kinds: Any, searched: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if kinds == "":  # no name at all is a name of nothing
+        with pytest.raises(SettingsError, match="unknown kind"):
+            tune({"n": linear_neck()}, {}, kinds=kinds)
+        return
+    found = begun(monkeypatch, kinds=kinds, budget=7, seed=3)
+    assert tuple(space.kind for space in found.spaces) == (searched or KINDS_SEARCHED)
+    assert (found.budget, found.task.seed, found.dropped, found.log.folder) == (7, 3, {}, None)
+    assert found.task.digest == digest_of(found.task, searched or KINDS_SEARCHED, None)
+
+
+def test_what_is_never_certified_beside_recordings_is_searched_only_where_it_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Task, "tested", True)
+    found = begun(monkeypatch)
+    assert [space.kind for space in found.spaces] == [kind for kind in KINDS_SEARCHED if kind != "adaptive"]
+    assert list(found.dropped) == ["adaptive"]
+    assert "--kinds" in found.dropped["adaptive"]
+    named = begun(monkeypatch, kinds="adaptive")
+    assert ([space.kind for space in named.spaces], named.dropped) == (["adaptive"], {})
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [({"budget": 0}, "budget"), ({"budget": 1_000_001}, "budget"), ({"budget": 2.5}, "budget"), ({"seed": -1}, "seed"),
+     ({"seed": 2**31 - 1}, "seed")],
+)  # fmt: skip
+def test_a_budget_and_a_seed_have_their_ends(asked: dict[str, Any], said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SettingsError, match=said):
+        tune({"n": linear_neck()}, {}, **asked)
+    for budget, seed in ((1, 0), (1_000_000, 2**31 - 2)):
+        found = begun(monkeypatch, kinds="pi", budget=budget, seed=seed)
+        assert (found.budget, found.task.seed) == (budget, seed)
+
+
+def test_the_observer_that_is_given_is_that_of_the_loops_and_must_be_of_the_robot(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert begun(monkeypatch, kinds="pi").task.observer.sample_time == linear_neck().pitch.dt
+    own = KalmanSettings().design(linear_neck())
+    assert begun(monkeypatch, kinds="pi", observer=own).task.observer is own
+    with pytest.raises(DataError, match="the observer and the plants"):
+        tune({"n": linear_neck()}, {}, observer=KalmanSettings().design(plant(Robot.preset("antagonist"))))
+
+
+def test_a_search_aims_at_the_cocontraction_of_the_recordings_in_four_digits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_tune, "_recorded_cocontraction", lambda *_: 0.123456)
+    [space] = begun(monkeypatch, kinds="pi").spaces
+    assert space.fixed["least_cocontraction"] == 0.1235
+    monkeypatch.setattr(_tune, "_recorded_cocontraction", lambda *_: None)
+    assert "least_cocontraction" not in begun(monkeypatch, kinds="pi").spaces[0].fixed
+
+
+def test_a_tuning_says_how_far_it_is_from_nothing_to_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nine tenths are the search, the rest its certificates; its result is of what they end with."""
+    said: list[float] = []
+
+    def course(*given: Any) -> None:
+        tell = given[-1]
+        for share in (0.0, 0.5, 1.0):
+            tell(share, "")
+
+    monkeypatch.setattr(_tune, "prepare", lambda _: None)
+    monkeypatch.setattr(Search, "run", lambda self: course(self.report))
+    monkeypatch.setattr(_tune, "_certify_search", lambda *given: course(*given) or ("search", "best", 3))
+    monkeypatch.setattr(_tune, "_make_result", lambda *given: course(*given) or given[:4])
+    found = tune({"n": linear_neck()}, {}, kinds="pi", workers=0, files={"f": ("a", "b")},
+                 progress=lambda share, _: said.append(share))  # fmt: skip
+    assert found == ("search", "best", 3, {"f": ("a", "b")})
+    assert said == pytest.approx([0.0, 0.45, 0.9, *[0.9, 0.95, 1.0] * 2])
+
+
+@pytest.mark.parametrize("attempts", [[], [2], [2, 5], [5, 2], [100], [100, 7]])
+def test_there_are_as_many_certificates_as_every_family_has_draws_for_and_at_most_six(attempts: list[int]) -> None:
+    families = {str(k): SimpleNamespace(draws=SimpleNamespace(attempts=count)) for k, count in enumerate(attempts)}
+    task: Any = SimpleNamespace(linear={"model": object(), "other": SimpleNamespace(draws=None), **families})
+    assert _tune._most_attempts(task) == min([6, *attempts])
