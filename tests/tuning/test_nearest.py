@@ -52,6 +52,21 @@ def test_a_slower_rise_than_the_default_is_told_and_certified_with_some_room() -
     assert again.bounds == asked.bounds
 
 
+@pytest.mark.parametrize(
+    "metric", ["sim.overshoot_pct", "sim.steady_rms_deg", "sim.settling_s", "track.circle_rms_deg"]
+)
+def test_a_relaxed_limit_keeps_its_reserve_and_a_file_of_it_asks_for_the_same(metric: str) -> None:
+    limit = 1.5 * bound(metric).limit
+    asked = relax_limits(ASKED, {metric: limit})
+    assert asked.limit(metric) == limit
+    assert (asked.robot_limit(metric) or 0.0) - limit == pytest.approx(ASKED.reserve.get(metric, 0.0), abs=1e-9)
+    again = make_tune_requirements({key: value for key, value in asked.table.items() if key != "version"})
+    assert again.limit(metric) == pytest.approx(limit, rel=1e-9)  # a file has 12 digits
+    assert [(b.metric, b.bound) for b in again.bounds] == [(b.metric, b.bound) for b in asked.bounds]
+    assert again.certificate.sim["duration_s"] == asked.certificate.sim["duration_s"]
+    assert asked.certificate.bounds == tuple(b for b in asked.bounds if not b.metric.startswith("track."))
+
+
 def test_the_worse_of_the_loops_with_noise_and_of_verify_counts() -> None:
     found = relaxations(candidate(sim__rise_s=0.7), [failed("sim.rise_s", 0.6)], ASKED)
     assert found["sim.rise_s"].reached == 0.7

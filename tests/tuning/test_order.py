@@ -32,12 +32,13 @@ from softneck.tuning._judge import (
 from softneck.tuning._requirements import make_tune_requirements
 from softneck.tuning._search import Candidate, Search, ratio
 from softneck.tuning._space import COSTLY
-from softneck.tuning._task import Job, Judgement, Task, circle_angles
+from softneck.tuning._task import Job, Judgement, Task, circle_angles, curve_times
 from softneck.tuning._tune import front
 from softneck.verification import LARGE, SMALL, Scale, metric_names
 from softneck.verification._linear import AxisMargins
 from softneck.verification._requirements import Requirement
 
+from ..design.test_robots import BELLOWS, LEARNED
 from ..order import MEMBERS, check_worst, is_worse
 from ..verification.necks import family, linear_neck
 
@@ -246,6 +247,27 @@ def test_variation_is_of_all_motors_and_moves_up_and_down() -> None:
     signals = {"motor_setpoint_1": zigzag, "motor_setpoint_2": -2.0 * zigzag, "motor_setpoint_3": np.zeros(rows)}
     result = LoopResult(np.arange(rows) * TS, signals, {}, TS)
     assert variation(result) == pytest.approx(10 * (0.1 + 0.2) / (10 * TS))
+    in_bar = {
+        f"{name}_setpoint": 1e5 * values
+        for name, values in zip("abcd", (zigzag, zigzag, 0 * zigzag, zigzag), strict=True)
+    }
+    of_bellows = LoopResult(result.time, in_bar, {}, TS, robot=BELLOWS)
+    assert variation(of_bellows) == pytest.approx(10 * 0.3 / (10 * TS))  # bar/s
+
+
+def test_curves_have_set_points_and_their_common_part_in_the_motors_unit() -> None:
+    # Of the last plant. What moves no output is the mean of four chambers in a ring, and nothing where each is alone.
+    y, P = np.array([[0.0, 3.0], [2.0, 1.0]]), 1e5 * np.array([[1.0, 1.0, 1.0, 1.0], [0.5, 1.0, 2.0, 2.5]])
+    ring: Any = SimpleNamespace(weights=np.eye(3, 4) - np.eye(3, 4, 1))
+    task = task_for({}, robot=BELLOWS)
+    found = {name: list(values) for name, values in _judge._step_curves(task, ring, y, P).items()}
+    assert found.pop("tautness") == pytest.approx([1.0, 1.5])
+    assert found == {
+        "low": [0.0, 1.0], "high": [2.0, 3.0], "value": [2.0, 1.0],
+        **{f"set_point_{j + 1}": list(P[:, j] / 1e5) for j in range(4)},
+    }  # fmt: skip
+    alone: Any = SimpleNamespace(weights=LEARNED)
+    assert _judge._step_curves(task, alone, y, P).keys() == found.keys()
 
 
 # -- candidates -------------------------------------------------------------------------------------------------------
@@ -332,8 +354,10 @@ def test_a_default_payload_that_was_not_recorded_is_told(
 # -- the loops of a candidate -----------------------------------------------------------------------------------------
 
 
-def task_for(table: dict[str, Any], robot: str = "neck", **more: Any) -> Any:
-    asked = make_tune_requirements(table, robot=Robot.preset(robot))
+def task_for(table: dict[str, Any], robot: str | Robot = "neck", time: float = 1.0, **more: Any) -> Any:
+    asked = make_tune_requirements(
+        table, scale=Scale(robot=robot if isinstance(robot, Robot) else Robot.preset(robot), time=time)
+    )
     return SimpleNamespace(
         **{"asked": asked, "robot": asked.certificate.robot, "cocontraction": None, "seed": 3, "own": {}, "linear": {},
            "drawn": (), "models": [], "observer": None, **more}
@@ -365,22 +389,28 @@ def _port(name: str, start: float = 0.0) -> Any:
 
 @pytest.mark.parametrize("pulls", [0.0, 0.6, None])
 @pytest.mark.parametrize("common", [None, 0.0, 0.4])
+@pytest.mark.parametrize("time", [1.0, 2.5])
 def test_the_cocontraction_that_is_asked_is_judged_unless_the_controller_pulls_by_its_own(
-    pulls: float | None, common: float | None, monkeypatch: pytest.MonkeyPatch
+    pulls: float | None, common: float | None, time: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Asked, judged, told: all loops are held at the recordings' co-contraction, from three seconds before the step."""
+    """Asked, judged, told: all loops are held at the recordings' co-contraction, from three seconds before the step.
+
+    All times are those of the neck times the robot's.
+    """
     monkeypatch.setattr(_judge, "step_loop", lambda *args, **more: (args, more))
-    task = task_for(CONDITIONS, cocontraction=common)
+    task = task_for(CONDITIONS, time=time, cocontraction=common)
     own = [] if pulls is None else [_port("least_cocontraction", pulls)]
     block: Any = SimpleNamespace(parameters=[_port("other"), *own], sample_time=TS)
     plant: Any = SimpleNamespace(quiet=lambda ts: ("quiet", ts))
     args, more = loop_of(Case(0, 0.5, math.pi / 2, part=0.3), plant, block, "parallel", task)  # pyright: ignore[reportGeneralTypeIssues]
     reference = args[4]
     together = 0.0 if pulls is not None else common or 0.0
-    at = 3.0 if pulls or together else 0.5
+    at = time * (3.0 if pulls or together else 0.5)
     assert reference(at + 0.1) == pytest.approx((0.0, 0.3 * math.radians(15.0), together), abs=1e-12)
     assert reference(at - 0.01) == (0.0, 0.0, together)
-    assert (args[1], args[3], more["duration"], more["order"]) == (("quiet", TS), 0.5, at + 5.0, "parallel")
+    assert (args[1], args[3], more["duration"], more["order"]) == (
+        ("quiet", TS), 0.5, pytest.approx(at + 5.0 * time), "parallel",
+    )  # fmt: skip
     assert more["faults"] == []
 
 
@@ -401,6 +431,8 @@ def test_noise_delay_and_circle_of_a_loop_are_those_that_are_asked(monkeypatch: 
     circle = loop(Case(0, 0.0, circle=True))
     # Half a second to begin, two to reach it, two turns of pi seconds.
     assert circle.duration == pytest.approx(2.5 + 2.0 * math.pi)
+    slow = loop_of(Case(0, 0.0, circle=True), plant, block, "sequential", task_for({"track": track}, time=3.0))
+    assert slow.duration == pytest.approx(3.0 * 2.5 + 2.0 * math.pi)
     angles = np.array([circle.reference(t)[:2] for t in 2.5 + np.linspace(0.0, math.pi, 9)])
     np.testing.assert_allclose(np.hypot(*angles.T), math.radians(12.0), rtol=0.05)
     turned = np.unwrap(np.arctan2(angles[:, 1], angles[:, 0]))
@@ -429,6 +461,9 @@ def test_the_distance_to_a_circle_is_least_at_the_lead_that_its_lag_asks_for(
     expected = np.degrees(0.4 * np.abs(np.sin((leads - lag) * TS)))
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
+    slow = task_for({"track": {"circle_rad_s": 2.0}}, time=3.0)
+    assert _judge._distances(loop, slow).shape == (121,)  # pyright: ignore[reportArgumentType]
+
     def overflow(*_: Any, **__: Any) -> LoopResult:
         raise DataError("overflow")
 
@@ -454,6 +489,7 @@ def test_curves_are_of_the_plain_steps_from_the_lowest_to_the_highest(monkeypatc
     ]
     every += [Case(1, 0.0, part=0.3), Case(1, 0.0, late=True)]
     run: list[Case] = []
+    bent = 0.07  # [rad] where it stands before
 
     def result(loop: Any, *, compiled: bool) -> LoopResult:
         run.append(loop.case)
@@ -461,10 +497,12 @@ def test_curves_are_of_the_plain_steps_from_the_lowest_to_the_highest(monkeypatc
         if loop.circle:
             return _circle(2 + loop.plant)
         t = np.arange(300) * TS
-        on = (t >= 0.5).astype(float)
+        on = (t >= 0.5 - 1e-9).astype(float)
         size = 0.1 * (1 + loop.plant)
-        signals = {"pitch": size * on, "roll": 9.0 * on, "pitch_reference": 0.2 * on, "roll_reference": 0.0 * on}
-        return LoopResult(t, signals | {f"motor_setpoint_{j}": j * on for j in (1, 2, 3)}, {}, TS)
+        signals = {"pitch": bent + size * on, "roll": 9.0 * on, "pitch_reference": bent + 0.2 * on,
+                   "roll_reference": 0.0 * on}  # fmt: skip
+        moved = {f"motor_setpoint_{j}": j * (1.0 + np.arange(300) - 25) * on for j in (1, 2, 3)}
+        return LoopResult(t, signals | moved, {}, TS)
 
     still = RobotReference(kind="step", values=(0.2, 0.0), at=0.5)
     monkeypatch.setattr(_judge, "loop_of", lambda case, *_: SimpleNamespace(case=case, reference=still))
@@ -481,8 +519,10 @@ def test_curves_are_of_the_plain_steps_from_the_lowest_to_the_highest(monkeypatc
     )
     assert found["low"][0] == pytest.approx(math.degrees(0.1), rel=1e-3)
     assert found["reference"] == [pytest.approx(math.degrees(0.2), rel=1e-3)]
-    assert [found[f"set_point_{j}"][0] for j in (1, 2, 3)] == [1.0, 2.0, 3.0]
-    assert found["tautness"][-1] == pytest.approx(2.0)
+    # Of the sample before each time, counted from the step on; the last for all that is later.
+    held = [1.0 + min(int(time / TS + 1e-6), 300 - 26) for time in curve_times(task)]
+    assert [found[f"set_point_{j}"] for j in (1, 2, 3)] == [[j * value for value in held] for j in (1, 2, 3)]
+    assert found["tautness"] == [2.0 * value for value in held]
     assert "circle" not in found
     circled = curves([*every, Case(0, 0.0, circle=True), Case(1, 0.0, circle=True)])
     assert circled["circle"] == pytest.approx([math.degrees(0.2)] * circle_angles().size, rel=1e-3)
@@ -504,7 +544,7 @@ def test_linear_curves_are_of_the_first_output_with_the_nominal_plant_last(monke
     y[0] = np.array([0.2, 0.1, 0.3])[:, None] * np.ones(400)
     y[:, :, 200:] = 7.0  # under the load
     P = np.zeros((2, 3, 400, 3))
-    P[0, 0] = [1.0, 2.0, 3.0]
+    P[0, 0] = (1.0 + np.arange(400))[:, None] * [1.0, 2.0, 3.0]
     tests: list[Any] = []
 
     def run(plants: Any, block: Any, test: Any, **_: Any) -> Any:
@@ -519,7 +559,8 @@ def test_linear_curves_are_of_the_first_output_with_the_nominal_plant_last(monke
     assert (tests[0].noise, tests[0].load) == (0.0, 0.0)
     ends = [found[name][-1] for name in ("low", "high", "value")]
     assert ends == pytest.approx([math.degrees(v) for v in (0.1, 0.3, 0.2)], rel=1e-3)
-    assert [found[f"set_point_{j}"][-1] for j in (1, 2, 3)] == [1.0, 2.0, 3.0]
+    held = [1.0 + min(int(time / TS + 1e-6), 199) for time in curve_times(task)]
+    assert [found[f"set_point_{j}"] for j in (1, 2, 3)] == [[j * value for value in held] for j in (1, 2, 3)]
     assert found["reference"] == [15.0]
 
 

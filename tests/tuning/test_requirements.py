@@ -28,9 +28,11 @@ from softneck.tuning._requirements import (
     _refuse_load,
     check_feasibility,
     default_rise,
+    fastest_rise,
     make_tune_requirements,
     read_tune_requirements,
 )
+from softneck.tuning._task import _closer
 from softneck.tuning._tune import task_of
 from softneck.verification import Requirement, make_requirements, read_requirements
 from softneck.verification._metrics import Scale
@@ -82,6 +84,23 @@ def test_where_draws_decide_the_search_alone_stays_below_the_default_limit() -> 
     assert make_tune_requirements(own, drawn=True).bounds == make_tune_requirements(own).bounds
     tight = make_tune_requirements({"require": {"sim.overshoot_pct": {"max": 1.0}}}, drawn=True)
     assert {b.limit for b in replace(task, asked=tight).aims if b.metric == "sim.overshoot_pct"} == {1.0}
+
+
+@pytest.mark.parametrize(("most", "below"), [(0.5, 0.3), (0.3, 0.5)])
+def test_of_two_upper_limits_the_lower_one_counts_and_a_lower_bound_is_none(most: float, below: float) -> None:
+    asked = make_tune_requirements({"require": {"sim.rise_s": {"min": 0.1, "max": most, "below": below}}})
+    assert asked.limit("sim.rise_s") == asked.robot_limit("sim.rise_s") == 0.3
+    assert {f"sim.rise_s >= 0.1, <= {most:g}, < {below:g}"} == {
+        "sim.rise_s " + ", ".join(line.partition(" ")[2] for line in asked.lines() if line.startswith("sim.rise_s "))
+    }
+    assert asked.limit("axes.gain_margin") is None
+
+
+@pytest.mark.parametrize("limit", [1.6, 1.7, 1.5])
+def test_what_a_search_keeps_of_a_limit_leaves_some_of_it(limit: float) -> None:
+    most, least = (_closer(Requirement("m", bound, limit, True), 1.6).limit for bound in ("max", "min"))
+    assert most == (pytest.approx(0.1) if limit > 1.6 else limit)
+    assert least == limit + 1.6
 
 
 def test_nothing_is_kept_back_of_what_is_not_asked() -> None:
@@ -176,15 +195,7 @@ def test_the_defaults_can_be_had() -> None:
 
 
 def test_a_rise_is_refused_exactly_where_the_motors_cannot_give_it() -> None:
-    # All the slew there is until the range ends, through the plant's own difference equation: 0.25 rad a sample of a
-    # motor is 0.375 of theta_i (Eq. 9), 6 rad 9; what a sample takes is told apart.
-    a, y, u, rows = math.exp(-POLE * TS), 0.0, 0.0, []
-    for _ in range(400):
-        rows.append(y / math.radians(15.0))
-        u = min(u + 0.375, 9.0)
-        y = a * y + GAIN * (1 - a) * u
-    low, high = (np.interp(level, rows, np.arange(400) * TS) for level in (0.1, 0.9))
-    least = float(high - low)
+    least = least_rise_by_hand(math.radians(15.0))
     for factor in (0.95, 1.05):
         table = {"require": {"sim.rise_s": {"max": least * factor}, "track.circle_rms_deg": False}}
         asked = make_tune_requirements(table)
@@ -265,7 +276,8 @@ def test_a_steady_state_quieter_than_the_sensor_is_refused(limit: float, noise: 
 
 
 def test_what_settles_before_it_can_rise_and_an_Ms_of_one_are_refused() -> None:
-    for metric, limit, match in (("sim.settling_s", 0.05, "slew and range"), ("axes.sensitivity", 1.0, "no feedback")):
+    for metric, limit, match in (("sim.settling_s", 0.05, "slew and range"), ("axes.sensitivity", 1.0, "no feedback"),
+                                 ("roll.sensitivity", 1.0, "no feedback")):  # fmt: skip
         asked = make_tune_requirements({"require": {metric: {"max": limit}}})
         with pytest.raises(SettingsError, match=match):
             check_feasibility(asked, neck())
@@ -321,15 +333,42 @@ def test_settling_is_judged_by_the_sensor_up_to_the_noise_that_fits_the_band() -
         assert asked.shows_settling(part) == shown
 
 
+def axis(pole: float, delay: int = DELAY, gain: float = GAIN) -> control.TransferFunction:
+    a = math.exp(-pole * TS)
+    return control.TransferFunction([gain * (1 - a)], [1.0, -a, *[0.0] * delay], TS)
+
+
+def least_rise_by_hand(size: float) -> float:
+    """All the slew there is until the range ends, through the plant's own difference equation.
+
+    0.25 rad a sample of a motor is 0.375 of theta_i (Eq. 9), 6 rad 9; what a sample takes is told apart.
+    """
+    a, y, u, rows = math.exp(-POLE * TS), 0.0, 0.0, []
+    for _ in range(400):
+        rows.append(y / size)
+        u = min(u + 0.375, 9.0)
+        y = a * y + GAIN * (1 - a) * u
+    low, high = (np.interp(level, rows, np.arange(400) * TS) for level in (0.1, 0.9))
+    return float(high - low)
+
+
+def test_the_fastest_rise_is_that_of_the_slowest_axis_that_the_motors_move_far_enough() -> None:
+    # The step of designs: 10 deg.
+    assert fastest_rise(neck()) == pytest.approx(least_rise_by_hand(math.radians(10.0)), rel=1e-9)
+    slow, quick, weak, none = axis(1.0), axis(POLE), axis(POLE, gain=0.4 * GAIN), axis(POLE, gain=0.1 * GAIN)
+    both = fastest_rise(LinearNeck(pitch=slow, roll=slow))
+    assert both > 1.5 * fastest_rise(neck())
+    for one, other in ((slow, quick), (quick, slow), (none, slow), (slow, none)):
+        assert fastest_rise(LinearNeck(pitch=one, roll=other)) == both
+    assert fastest_rise(LinearNeck(pitch=weak, roll=quick)) > 1.5 * fastest_rise(neck())
+    assert fastest_rise(LinearNeck(pitch=none, roll=none)) == 0.0
+
+
 def test_the_default_rise_is_that_of_the_slowest_axis() -> None:
     """Worse axes and plants never ask for a shorter rise, a quick robot is asked for the usual one, settling bounds."""
     asked = make_tune_requirements(
         {"sim": {"size_deg": 15.0, "duration_s": 60.0}, "require": {"sim.settling_s": {"max": 50.0}}}
     )
-
-    def axis(pole: float, delay: int = DELAY) -> control.TransferFunction:
-        a = math.exp(-pole * TS)
-        return control.TransferFunction([GAIN * (1 - a)], [1.0, -a, *[0.0] * delay], TS)
 
     def rise(pitch: float, roll: float, *, delay: int = DELAY, more: Sequence[float] = ()) -> float:
         plants = [LinearNeck(pitch=axis(pitch), roll=axis(roll, delay))]

@@ -23,7 +23,7 @@ from softneck.robot import Robot
 from softneck.tuning import task_of, tune
 from softneck.tuning._judge import cases, judged_delay, told_conditions
 from softneck.tuning._requirements import make_tune_requirements
-from softneck.tuning._search import Candidate, ratio, run_jobs
+from softneck.tuning._search import Candidate, _optimiser, in_words, ratio, run_jobs
 from softneck.tuning._space import KINDS_SEARCHED, spaces
 from softneck.tuning._task import _LOG_FORMAT, FILE, Job, Log, Task
 from softneck.tuning._tune import Tuned, active_requirement, front
@@ -153,6 +153,32 @@ def test_a_log_with_another_value_is_refused_in_one_line(tmp_path: Path, damage:
     with pytest.raises(FileFormatError, match=f"is no log of a search.*{said}") as refused:
         Log(tmp_path, "d")
     assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [({"format": 2}, "another format"), ({"format": None}, "another format"), ({"evaluations": {}}, "another format"),
+     ({"evaluations": None}, "another format"), ({"format": ...}, "format"), ({"evaluations": ...}, "evaluations")],
+)  # fmt: skip
+def test_a_log_of_another_format_is_refused_in_one_line(tmp_path: Path, given: dict[str, Any], said: str) -> None:
+    whole = {"format": 1, "digest": "d", "evaluations": []}
+    (tmp_path / FILE).write_text(json.dumps(whole))
+    assert not Log(tmp_path, "d").found
+    told = {key: value for key, value in (whole | given).items() if value is not ...}
+    (tmp_path / FILE).write_text(json.dumps(told))
+    with pytest.raises(FileFormatError, match=f"is no log of a search.*{said}"):
+        Log(tmp_path, "d")
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_log_of_another_search_is_replaced_only_by_force(tmp_path: Path, force: bool) -> None:
+    Log(tmp_path, "first").write()
+    if force:
+        Log(tmp_path, "other", force=True).write()
+        assert json.loads((tmp_path / FILE).read_text())["digest"] == "other"
+    else:
+        with pytest.raises(OutputFileError, match="holds a search over other plants"):
+            Log(tmp_path, "other")
 
 
 def test_a_log_gives_back_what_was_judged_and_has_refusals_tried_again(tmp_path: Path) -> None:
@@ -321,6 +347,33 @@ def test_a_value_that_is_no_number_does_not_hold() -> None:
         assert ratio(bound, math.nan) == math.inf
     item = candidate(sim__rise_s=math.nan, sim__overshoot_pct=3.0)
     assert not item.holds(BOUNDS[:2], tested=False)
+
+
+@pytest.mark.parametrize(
+    ("metrics", "cost", "said"),
+    [
+        ({"sim.rise_s": 0.444, "sim.overshoot_pct": 5.04, "axes.gain_margin": 2.345}, 0.9,
+         "best pi, rise 0.44 s, overshoot 5.0 %, gain margin 2.3, all hold"),
+        # Of loops before that of linear plants; what is unknown or never reached is left out.
+        ({"sim.rise_s": math.inf, "step.rise_s": 0.3, "sim.overshoot_pct": 7.0, "step.overshoot_pct": 1.0}, 1.25,
+         "best pi, rise 0.30 s, overshoot 7.0 %, 0.25 beyond limits"),
+        ({"axes.gain_margin": math.nan}, 1.0, "best pi, all hold"), ({}, math.inf, "best pi, inf beyond limits"),
+    ],
+)  # fmt: skip
+def test_the_best_so_far_is_said_in_words(metrics: dict[str, float], cost: float, said: str) -> None:
+    assert in_words(Candidate("pi", {}, np.zeros(1), "all", metrics), cost) == said
+
+
+@pytest.mark.parametrize("kind", ["pi", "lqg"])
+def test_each_kind_and_seed_draws_its_own_candidates(kind: str) -> None:
+    (space,) = spaces((kind,), rise=0.4, cocontraction=None, robot=Robot.preset())
+
+    def first(*given: Any) -> tuple[float, ...]:
+        return tuple(_optimiser(space, *given).ask())
+
+    drawn = [first(seed, number) for seed in (0, 1, 2**31 - 2) for number in (0, 1, 6)]
+    assert len(set(drawn)) == len(drawn)
+    assert first(1, 1) == drawn[4]
 
 
 def test_few_requirements_are_broken_rather_than_all_a_little() -> None:
