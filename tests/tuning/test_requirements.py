@@ -191,6 +191,9 @@ def test_a_file_says_what_differs(tmp_path: Path) -> None:
 
 
 def test_the_defaults_can_be_had() -> None:
+    # The defaults of a file are those of a table: loops over simulation models, and no draws.
+    read, made = read_tune_requirements(), make_tune_requirements({})
+    assert (read.bounds, read.kept, read.reserve, read.table) == (made.bounds, made.kept, made.reserve, made.table)
     check_feasibility(make_tune_requirements({}), neck())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -204,8 +205,15 @@ def test_what_diverges_agrees_with_nothing_and_an_output_at_rest_hides_no_other(
     for lost in (np.nan, np.inf):
         gone = runs["a"][1].copy()
         gone[3, 1] = lost
-        found = agreement({**runs, "d": [runs["a"][0], gone]}, worth)
-        assert found == {**whole, "d": float("-inf")}
+        # It has no vote either, however much it was worth; nor has one that was worth nothing known.
+        for told in (worth, worth | {"d": 99.0}):
+            assert agreement({**runs, "d": [runs["a"][0], gone]}, told) == {**whole, "d": float("-inf")}
+    for unknown in (float("-inf"), float("nan"), float("inf")):
+        assert agreement({**runs, "d": runs["a"]}, worth | {"d": unknown}) == {**whole, "d": whole["a"]}
+        assert agreement(runs, worth | {"a": unknown}) == {}
+    # A model that is right to a percent weighs no more than that: two of them never outvote three by more.
+    runs["e"] = [truth + 0.1 * rng.standard_normal(truth.shape) for _ in range(2)]
+    assert agreement(runs, worth | {"a": 99.0, "e": 90.0}) == agreement(runs, worth | {"a": 99.99, "e": 90.0})
     still = {name: [free * np.array([1.0, 0.0]) for free in each] for name, each in runs.items()}
     alone = {name: [free[:, :1] for free in each] for name, each in runs.items()}
     assert agreement(still, worth) == agreement(alone, worth)
@@ -365,3 +373,319 @@ def test_agreement_is_explained_where_it_was_computed(test: str) -> None:
     one = KindTrial("rls", 0.0, left_out={test: 40.0, HOLD_OUT: 90.0})
     said = " Agreement: fit to the median of all kinds on motions that nobody recorded."
     assert _auto._explain_agreement((KindTrial("nn", 0.0), one)) == (said if test == _auto.EXAM else "")
+
+
+# -- a race of kinds whose fits are formulas ---------------------------------------------------------------------------
+
+
+FITS = {"pitch": 80.0, "roll": 60.0}
+
+
+def part(name: str, fits: dict[str, float] = FITS, error: float = 2.0) -> Any:
+    return SimpleNamespace(name=name, fits=lambda _: (fits, error))
+
+
+def racing(monkeypatch: pytest.MonkeyPatch, *, judged: int = 1, more: int = 0, fails: str = "") -> tuple[_Race, list]:
+    """Return a race whose trainings are recorded, of which those of a kind fail."""
+    fitted: list[Any] = []
+
+    class Settings:
+        def __init__(self, kind: str, seed: int, other: Any) -> None:
+            self.told = (kind, seed, dict(other))
+
+        def fit(self, recording: Any) -> Any:
+            fitted.append((*self.told, recording))
+            if self.told[0] == fails:
+                raise DataError("it saturates")
+            return f"{self.told[0]} of {len(recording)}"
+
+    monkeypatch.setattr(_auto, "_settings", Settings)
+    monkeypatch.setattr(_auto, "all_rows", lambda name, _: part(name, {"pitch": 90.0, "roll": 50.0}, 3.0))
+    monkeypatch.setattr(_auto, "numbers_of", lambda model: len(str(model)))
+    monkeypatch.setattr(_Race, "_validate", lambda *_: SimpleNamespace(fits={_auto.INFINITE: FITS}, cold_fits=FITS))
+    monkeypatch.setattr(_auto, "calibrate_validity", lambda model, short, *_: f"{model}, held by {short}")
+    monkeypatch.setattr(_auto, "unseen_rows", lambda fold: (fold,))
+    monkeypatch.setattr(_auto, "second_training", lambda *_: {"pitch": 10.0})
+    monkeypatch.setattr(_auto, "noise_si", lambda _: np.array([0.1, 0.2]))
+    folds: list[Any] = [SimpleNamespace(train=TRAIN.rows(0, 800), judged=tuple(map(part, "abc"[:judged])))]
+    folds += [SimpleNamespace(train=TRAIN.rows(0, 700 - k), judged=(part(f"run {k}", FITS),)) for k in range(more)]
+    return _Race(TRAIN, OTHER, folds, 5), fitted
+
+
+def ran(kind: str, fit: float = 70.0, **more: Any) -> KindTrial:
+    return KindTrial(kind, 1.0, **{"model": f"{kind} made", "left_out": {"a": fit}, "whole": False, **more})
+
+
+def test_a_short_training_is_scored_on_each_part_and_a_failure_costs_its_own_time_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    race, fitted = racing(monkeypatch, judged=2, fails="oe")
+    begin = time.perf_counter()
+    for kind in ("rls", "oe", "nlsm", "greybox"):
+        race.screen(kind)
+    one = race.tried["rls"]
+    assert (one.left_out, one.errors) == ({"a": 70.0, "b": 70.0, HOLD_OUT: 70.0}, {"a": 2.0, "b": 2.0, HOLD_OUT: 3.0})
+    assert one.outputs == {"a": FITS, "b": FITS, HOLD_OUT: {"pitch": 90.0, "roll": 50.0}}
+    assert (one.model, one.whole, one.failure, race.short["rls"]) == ("rls of 800", False, "", "rls of 800")
+    failed = race.tried["oe"]
+    assert (failed.model, failed.failure, failed.fit) == (None, "it saturates", float("-inf"))
+    assert [(kind, seed, len(rows)) for kind, seed, _, rows in fitted] == [
+        (kind, 5, 800) for kind in ("rls", "oe", "nlsm", "greybox")
+    ]
+    # A set's epsilon is eight deviations of the louder output's noise; a grey box is of the cheaper settings.
+    assert fitted[2][2] == {"output_weight": 5.0, "epsilon": pytest.approx(8.0 * 0.2)}
+    assert fitted[3][2] == _auto.SHORT["greybox"]
+    assert 0.0 <= sum(one.seconds for one in race.tried.values()) <= time.perf_counter() - begin
+
+
+@pytest.mark.parametrize("judged", [0, 1])
+@pytest.mark.parametrize("kind", ["rls", "greybox"])
+def test_a_whole_training_is_judged_again_and_held_to_what_its_short_one_kept(
+    judged: int, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    race, fitted = racing(monkeypatch, judged=judged)
+    found: list[Any] = []
+    monkeypatch.setattr(_auto, "as_found", lambda settings, model: found.append(model) or settings)
+    race.short[kind] = "short"  # pyright: ignore[reportArgumentType]
+    race.tried[kind] = ran(kind, errors={"a": 1.5}, outputs={"a": FITS})
+    begin = time.perf_counter()
+    race.whole(kind)
+    one, again = race.tried[kind], kind == "greybox" and judged == 1
+    short = "greybox of 800" if again else "short"
+    assert (one.model, one.whole) == (f"{kind} of 900" + f", held by {short}" * judged, True)
+    # A grey box takes over the form that was found, in its short settings.
+    assert found == [f"{kind} of 900"] * again
+    assert [(told, len(rows)) for _, _, told, rows in fitted] == [({}, 900)] + [(_auto.SHORT["greybox"], 800)] * again
+    second = {_auto.SECOND: {"pitch": 10.0}} if judged else {}
+    assert one.outputs == {"a": FITS, HOLD_OUT: {"pitch": 90.0, "roll": 50.0}, **second}
+    assert one.errors == {"a": 1.5, HOLD_OUT: 3.0}
+    assert one.scores == {"a": 70.0, HOLD_OUT: 70.0, COLD: 70.0}
+    assert 1.0 <= one.seconds <= 1.0 + time.perf_counter() - begin
+
+
+@pytest.mark.parametrize("made", [True, False])
+def test_a_kind_that_fails_in_its_whole_training_keeps_its_reason(made: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    race, fitted = racing(monkeypatch, fails="oe")
+    race.tried["oe"] = ran("oe") if made else ran("oe", model=None, failure="too short")
+    race.whole("oe")
+    one = race.tried["oe"]
+    assert (one.model, one.failure, one.fit, one.seconds) == (
+        None, "it saturates" if made else "too short", float("-inf"), 1.0,
+    )  # fmt: skip
+    assert len(fitted) == made  # one that could not be made short is not made whole
+
+
+def test_each_later_part_is_left_out_of_the_better_half_of_those_that_ran(monkeypatch: pytest.MonkeyPatch) -> None:
+    race, fitted = racing(monkeypatch, more=3)
+    fits = {"rls": 60.0, "oe": 90.0, "play": 75.0, "greybox": float("-inf"), "nlsm": 80.0, "nn": 50.0}
+    race.tried = {kind: ran(kind, fit) for kind, fit in fits.items()}
+    said: list[tuple[float, str]] = []
+    begin = time.perf_counter()
+    race.leave_out(lambda share, what: said.append((share, what)))
+    # Of five that ran three go on, then two; all of these score 70 there, so the order stays.
+    assert [(kind, len(rows)) for kind, _, _, rows in fitted] == [
+        *[(kind, 700) for kind in ("oe", "nlsm", "play")], *[(kind, 699) for kind in ("oe", "nlsm")],
+        *[(kind, 698) for kind in ("oe", "nlsm")],
+    ]  # fmt: skip
+    assert [text for _, text in said][:4] == [
+        "oe without run 0", "nlsm without run 0", "play without run 0", "oe without run 1",
+    ]  # fmt: skip
+    shares = [share for share, _ in said]
+    assert shares == sorted(shares)
+    assert set(shares) == {0.25, 0.5, 0.75}
+    assert race.tried["oe"].left_out == {"a": 90.0, "run 0": 70.0, "run 1": 70.0, "run 2": 70.0}
+    assert race.tried["rls"].left_out == {"a": 60.0}
+    assert all(1.0 <= one.seconds <= 1.0 + time.perf_counter() - begin for one in race.tried.values())
+
+
+@pytest.mark.parametrize(
+    ("whole", "trained", "best"),
+    [
+        # It is trained, and stays the best.
+        ({"rls": 80.0, "oe": 90.0, "play": 85.0}, ["oe"], "oe"),
+        # It falls behind the next, which is trained too.
+        ({"rls": 60.0, "oe": 70.0, "play": 85.0}, ["oe", "play"], "play"),
+        # Two at most: then the better of those that were trained.
+        ({"rls": 60.0, "oe": 70.0, "play": 71.0}, ["oe", "play"], "play"),
+        ({"rls": 60.0, "oe": 70.0, "play": 69.0}, ["oe", "play"], "oe"),
+        # One that fails is no result: a third is trained.
+        ({"rls": 60.0, "oe": float("-inf"), "play": float("-inf")}, ["oe", "play", "rls"], "rls"),
+    ],
+)
+def test_at_most_two_kinds_are_trained_on_all_rows_until_the_best_one_is(
+    whole: dict[str, float], trained: list[str], best: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    race, _ = racing(monkeypatch)
+    race.tried = {kind: ran(kind, fit) for kind, fit in (("rls", 72.0), ("oe", 92.0), ("play", 86.0))}
+    made: list[str] = []
+
+    def train(kind: str) -> None:
+        made.append(kind)
+        fit = whole[kind]
+        race.tried[kind] = replace(race.tried[kind], left_out={"a": fit}, whole=fit > float("-inf"))
+
+    monkeypatch.setattr(race, "whole", train)
+    said: list[str] = []
+    found = race.train_best(lambda _, what: said.append(what))
+    assert (made, found.kind) == (trained, best)
+    assert said == [f"{kind} on all rows to train on" for kind in trained]
+    # Where nothing at all can be made, that is an error.
+    race.tried = {"rls": ran("rls", float("-inf"), failure="no")}
+    with pytest.raises(DataError, match="no kind could be identified: no"):
+        race.train_best(silent)
+
+
+@pytest.mark.parametrize(
+    ("fits", "numbers", "chosen"),
+    [
+        ({"rls": 80.0, "oe": 80.4}, {"rls": 5, "oe": 6}, "rls"),
+        ({"rls": 80.0, "oe": 80.5}, {"rls": 5, "oe": 6}, "oe"),  # half a point is no longer alike
+        ({"rls": 80.0, "oe": 80.4}, {"rls": 7, "oe": 6}, "oe"),
+        ({"oe": 80.4, "rls": 80.0}, {"rls": 6, "oe": 6}, "rls"),  # of equal size the one that is easier to read
+        ({"nn": 80.4, "play": 80.0, "greybox": 80.3}, {"nn": 6, "play": 6, "greybox": 6}, "greybox"),
+    ],
+)
+def test_of_kinds_within_half_a_point_the_one_of_fewest_numbers_is_taken(
+    fits: dict[str, float], numbers: dict[str, int], chosen: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    race, _ = racing(monkeypatch)
+    monkeypatch.setattr(_auto, "numbers_of", lambda model: numbers[str(model).split()[0]])
+    race.tried = {kind: ran(kind, fit) for kind, fit in fits.items()}
+    assert race._simplest_of_the_best().kind == chosen
+    assert ran("rls", model=None).numbers == 0
+
+
+def test_a_guarded_form_costs_its_own_time_and_tells_its_own_rows_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    race, _ = racing(monkeypatch)
+    race.tried = {"oe": ran("oe", 60.0), "rls": ran("rls", 90.0)}
+    best = ran("play", outputs={"a": FITS, _auto.SECOND: FITS, HOLD_OUT: FITS}, errors={"a": 1.0})
+    said: list[str] = []
+    monkeypatch.setattr(Guarded, "fit", lambda settings, *_, **__: f"guarded {settings.of} {settings.base}")
+    begin = time.perf_counter()
+    chosen = race.guard_best(best, lambda _, what: said.append(what))
+    assert (chosen.kind, chosen.model, said) == ("guarded", "guarded play oe", ["guarded form of play"])
+    # What two trainings of its kind part is not its own; its hold-out is.
+    assert chosen.outputs == {"a": FITS, HOLD_OUT: {"pitch": 90.0, "roll": 50.0}}
+    assert (chosen.left_out, chosen.errors, race.tried["guarded"]) == (best.left_out, best.errors, chosen)
+    assert 0.0 <= chosen.seconds <= time.perf_counter() - begin
+    # What diverged is no base, and a kind that failed has no guarded form.
+    race.tried["oe"] = ran("oe", float("-inf"))
+    assert race.guard_best(best, silent) is best
+    race.tried["oe"] = ran("oe", 60.0)
+    none = ran("play", model=None)
+    assert race.guard_best(none, silent) is none
+
+    def fails(*_: Any, **__: Any) -> Any:
+        raise DataError("no base")
+
+    monkeypatch.setattr(Guarded, "fit", fails)
+    assert race.guard_best(best, silent) is best
+    assert race.tried["guarded"].failure == "no base"
+    assert 0.0 <= race.tried["guarded"].seconds <= time.perf_counter() - begin
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_the_best_of_the_other_sort_is_trained_on_all_rows_once(whole: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    race, made = racing(monkeypatch)
+    race.tried = {"rls": ran("rls", 80.0), "play": ran("play", 70.0, whole=whole), "nn": ran("nn", 60.0)}
+    race.short = dict.fromkeys(race.tried, "short")  # pyright: ignore[reportAttributeAccessIssue]
+    race.train_other(race.tried["rls"])
+    assert [kind for kind, *_ in made] == ([] if whole else ["play"])
+
+
+def test_no_exam_without_parts_left_out_and_none_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Any] = []
+    monkeypatch.setattr(_auto, "exams", lambda rows: made.append(len(rows)) or ["motion"])
+    monkeypatch.setattr(_auto, "free_runs", lambda model, _: made.append(model) or [])
+    monkeypatch.setattr(_auto, "agreement", lambda runs, _: dict.fromkeys(runs, 33.0))
+    race, _ = racing(monkeypatch, judged=0)
+    race.tried = {"rls": ran("rls")}
+    race.examine()
+    assert (made, race.tried["rls"].left_out) == ([], {"a": 70.0})
+    race, _ = racing(monkeypatch)
+    race.tried = {"rls": ran("rls"), "oe": ran("oe", model=None)}
+    race.examine()
+    race.examine()
+    assert made == [800, "rls made"]
+    assert race.tried["rls"].left_out == {"a": 70.0, EXAM: 33.0}
+    assert race.tried["oe"].left_out == {"a": 70.0}
+
+
+def test_a_choice_says_how_far_it_is_and_what_is_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kinds are screened in a fixed order; those within half a point of the best are named beside it."""
+    racing(monkeypatch)
+    monkeypatch.setattr(_auto, "folds", lambda *_, **__: [SimpleNamespace(train=TRAIN, judged=(part("a"),))])
+    monkeypatch.setattr(_Race, "examine", lambda _: None)
+    monkeypatch.setattr(_auto, "other_motion", lambda _: True)
+    monkeypatch.setattr(_Race, "guard_best", lambda _, best, tell: tell(0.5, "guard") or best)
+    fits = {"rls": 80.0, "oe": 79.6, "play": 60.0, "nlsm": 79.0}
+
+    def screen(self: _Race, kind: str) -> None:
+        self.tried[kind] = ran(kind, fits[kind])
+        self.short[kind] = "short"  # pyright: ignore[reportArgumentType]
+
+    def whole(self: _Race, kind: str) -> None:
+        self.tried[kind] = replace(self.tried[kind], whole=True)
+
+    monkeypatch.setattr(_Race, "screen", screen)
+    monkeypatch.setattr(_Race, "whole", whole)
+    said: list[tuple[float, str]] = []
+    found = choose(TRAIN, OTHER, kinds=("nlsm", "play", "rls", "oe"), other_excitation=False, seed=4,
+                   progress=lambda *told: said.append(told))  # fmt: skip
+    assert (found.chosen.kind, found.other_motion) == ("oe", True)  # fewer letters, which stand for numbers
+    assert [one.kind for one in found.ranking] == ["rls", "oe", "nlsm", "play"]
+    assert "rls reaches 80.0 %" in found.why
+    assert "nlsm" not in found.why
+    assert [share for share, _ in said] == pytest.approx([0.0, 0.175, 0.35, 0.525, 0.8, 0.95, 1.0])
+    assert [text for _, text in said] == [
+        "rls", "oe (best so far rls, 80.0 %)", "play (best so far rls, 80.0 %)", "nlsm (best so far rls, 80.0 %)",
+        "oe on all rows to train on", "guard", "chosen: oe",
+    ]  # fmt: skip
+    # What was chosen is linear: the best nonlinear kind is trained on all rows too.
+    assert [one.kind for one in found.ranking if one.whole] == ["oe", "nlsm"]
+
+
+@pytest.mark.parametrize("samples", [(2, 2), (1, 2), (2, 1), (0, 0)])
+def test_two_samples_of_each_output_are_the_least_to_judge_by(
+    samples: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    y = np.full((500, 2), np.nan)
+    y[0] = OTHER.outputs[0]  # aligns the run and is not judged
+    for k, count in enumerate(samples):
+        y[30 : 30 + count, k] = OTHER.outputs[30 : 30 + count, k]
+    monkeypatch.setattr(_auto, "folds", lambda *_, **__: pytest.fail("they are enough") if min(samples) < 2 else [])
+    monkeypatch.setattr(_Race, "screen", lambda *_: (_ for _ in ()).throw(KeyError("screened")))
+    held = OTHER.with_channels(pitch=y[:, 0], roll=y[:, 1])
+    if min(samples) >= 2:
+        with pytest.raises(KeyError, match="screened"):
+            choose(TRAIN, held, kinds=("rls",))
+    else:
+        name = "pitch" if samples[0] < 2 else "roll"
+        with pytest.raises(DataError, match=rf"`{name}` has {min(samples)} sample\(s\) in the rows held out"):
+            choose(TRAIN, held, kinds=("rls",))
+
+
+def test_what_is_wary_of_a_ranking_is_said_of_it() -> None:
+    lost, good = KindTrial("nn", 0.0, failure="no"), KindTrial("rls", 0.0, left_out={HOLD_OUT: 70.0})
+    assert _auto._remarks((good,), other_excitation=True) == ()
+    [same] = _auto._remarks((good,), other_excitation=False)
+    assert "Give a second recording" in same
+    assert _auto._remarks((good, lost), other_excitation=True) == ("Not identified or diverged: nn.",)
+    assert _auto._failure_reasons([lost, KindTrial("oe", 0.0, failure="no")]) == "no"
+    assert _auto._failure_reasons([lost, good]) == "nn: no; rls: its simulation diverged"
+    assert _auto._progress_text("oe", []) == _auto._progress_text("oe", [lost]) == "oe"
+    # Outputs at rest have no fit; where none moves nothing is known.
+    nan = float("nan")
+    assert _auto._mean_of_moved({"pitch": 80.0, "roll": nan}) == 80.0
+    assert _auto._mean_of_moved({"pitch": nan}) == _auto._mean_of_moved({}) == float("-inf")
+    told = _auto._with(good, {"a": (FITS, nan), "b": (FITS, 0.0)})
+    assert (told.left_out, told.errors) == ({HOLD_OUT: 70.0, "a": 70.0, "b": 70.0}, {"b": 0.0})
+
+
+@pytest.mark.parametrize("kind", kinds_to_try())
+def test_kinds_that_start_at_random_have_the_seed_of_the_choice(kind: str) -> None:
+    made = _auto._settings(kind, 7, {})
+    assert getattr(made, "seed", 7) == 7
+    if kind == "nlsm":
+        assert made.form == "residual"
+        assert _auto._settings(kind, 7, {"epsilon": 0.5}).epsilon == 0.5

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from softneck.core import DataError, silent
 from softneck.identification import Model, Play, SetMembership, identify, with_tolerance
-from softneck.identification.models._left_out import folds
+from softneck.identification.models import _left_out
+from softneck.identification.models._left_out import Judged, folds, standard_error
+from softneck.identification.models._scores import nrmse_fit
 from softneck.identification.models._validity import calibrate_validity, tolerance_of
 from softneck.identification.selection._examination import (
     Examination,
@@ -136,3 +141,202 @@ def test_bounds_are_told_with_what_they_held_and_their_width() -> None:
     least = min(bounds["held_pct"].values())
     assert f"{least:.0f} % of motions left out" in found.summary()
     assert ("are no 90 % bounds" in found.summary()) == (least < 90.0)
+
+
+# -- what is left out -------------------------------------------------------------------------------------------------
+
+
+def of_runs(lengths: Sequence[int], U: np.ndarray, Y: np.ndarray | None = None) -> Recording:
+    """Return a recording of runs that follow each other, with these set-points and outputs."""
+    starts = np.cumsum([0, *lengths])[:-1]
+    y = 0.1 * np.random.default_rng(7).standard_normal((len(U), 2)) if Y is None else Y
+    parts = []
+    for start, rows in zip(starts, lengths, strict=True):
+        channels = {f"motor_setpoint_{j + 1}": U[start : start + rows, j] for j in range(3)}
+        channels |= {name: y[start : start + rows, k] for k, name in enumerate(("pitch", "roll"))}
+        parts.append(Recording(0.02 * np.arange(rows), 0.02, channels))
+    return concatenate(parts)
+
+
+def test_the_largest_rows_are_those_beyond_a_quantile_and_their_neighbours_in_the_same_run() -> None:
+    lengths = [50, 30, 40]
+    rng = np.random.default_rng(0)
+    recording, size, reach = of_runs(lengths, rng.standard_normal((120, 3))), rng.random(120), 4
+    size[[49, 80, 79]] = 9.0  # at the ends of runs
+    expected = np.zeros(120, dtype=bool)
+    run = np.repeat([0, 1, 2], lengths)
+    for k in np.flatnonzero(size > np.quantile(size, 0.88)):
+        near = np.abs(np.arange(120) - k) <= reach
+        expected |= near & (run == run[k])
+    np.testing.assert_array_equal(_left_out._largest_rows(recording, size, reach), expected)
+    assert not expected.all()
+    np.testing.assert_array_equal(_left_out._largest_rows(recording, size, 0), size > np.quantile(size, 0.88))
+
+
+@pytest.mark.parametrize("span", [1, 4, 5, 30, 50])
+def test_a_speed_is_the_change_around_each_row_within_its_run(span: int) -> None:
+    lengths, rng = [50, 30, 40], np.random.default_rng(1)
+    U = np.cumsum(rng.standard_normal((120, 3)), axis=0)
+    U[:, 2] = 5.0  # a motor that rests
+    recording = of_runs(lengths, U)
+    scaled = (U - U.mean(axis=0)) / np.where(U.std(axis=0) > 0.0, U.std(axis=0), 1.0)
+    np.testing.assert_allclose(_left_out._sizes(recording), np.hypot(scaled[:, 0], scaled[:, 1]), rtol=1e-12)
+    expected, start = np.zeros(120), 0
+    for rows in lengths:
+        for k in range(rows - span):
+            change = scaled[start + k + span] - scaled[start + k]
+            expected[start + k + span // 2] = np.sqrt((change**2).sum())
+        start += rows
+    np.testing.assert_allclose(_left_out._speeds(recording, span), expected, rtol=1e-12)
+
+
+def test_extreme_motions_are_blanked_as_long_as_two_hundred_rows_of_each_output_are_left() -> None:
+    recording = neck_recording(600)
+    slow = 5.4
+    far = _left_out._largest_rows(recording, _left_out._sizes(recording), 5)
+    fast = _left_out._largest_rows(recording, _left_out._speeds(recording, 14), 5)  # 2.5 time constants of 5.4
+    left = int((~(far | fast)).sum())
+    assert 200 <= left < 600
+    blanked, judged = _left_out._blank_extreme_motions(recording, slow)
+    np.testing.assert_array_equal(np.isnan(blanked.outputs).any(axis=1), far | fast)
+    np.testing.assert_array_equal(blanked.set_points, recording.set_points)
+    scored = np.arange(600) >= 25
+    for part, name, rows in zip(judged, ("largest motions", "fastest motions"), (far, fast), strict=True):
+        assert (part.name, part.recording) == (name, recording)
+        np.testing.assert_array_equal(part.rows, rows & scored)
+    # 200 samples of the output with the fewest are enough, and 199 are not.
+    kept = np.flatnonzero(~(far | fast))
+    for wanted in (200, 199):
+        y = recording.outputs.copy()
+        y[kept[wanted:], 1] = np.nan
+        found, parts = _left_out._blank_extreme_motions(recording.with_channels(roll=y[:, 1]), slow)
+        assert len(parts) == (2 if wanted == 200 else 0)
+        assert np.isnan(found.outputs[:, 0]).any() == bool(parts)
+    # A robot that is quicker than a sample moves over one sample at least.
+    assert _left_out._blank_extreme_motions(recording, 0.01)[1][1].name == "fastest motions"
+
+
+@pytest.mark.parametrize(
+    ("lengths", "head", "tail"),
+    [([2000], 2000, None), ([2240], 2000, None), ([2250], 2000, 250), ([1500, 1500], 2000, 1000),
+     ([1000, 1000, 300], None, None)],
+)  # fmt: skip
+def test_the_first_two_thousand_rows_are_screened_and_a_rest_of_ten_warm_ups_is_the_later_block(
+    lengths: list[int], head: int | None, tail: int | None
+) -> None:
+    U = np.random.default_rng(2).standard_normal((sum(lengths), 3))
+    first, rest = _left_out._first_rows(of_runs(lengths, U))
+    assert (None if rest is None else len(rest)) == tail
+    if head is not None:
+        assert len(first) == head
+
+
+@pytest.mark.parametrize(
+    ("lengths", "groups"),
+    [([900], []), ([300, 300], [[0], [1]]), ([300, 300, 300], [[0], [1], [2]]), ([300] * 4, [[0], [1, 2], [3]]),
+     ([300] * 6, [[0, 1], [2, 3], [4, 5]]), ([300, 249, 300], [[0], [2]]), ([300, 250], [[0], [1]]),
+     ([300, 249], []), ([249, 250, 249], [[0], [1], [2]][1:2])],
+)  # fmt: skip
+def test_runs_are_left_out_in_at_most_three_groups_of_ten_warm_ups_or_more(
+    lengths: list[int], groups: list[list[int]]
+) -> None:
+    U = np.random.default_rng(3).standard_normal((sum(lengths), 3))
+    recording = of_runs(lengths, U)
+    runs = recording.runs()
+    found = _left_out._groups(recording)
+    assert len(found) == len(groups)
+    for (group, others), numbers in zip(found, groups, strict=True):
+        rest = [k for k in range(len(runs)) if k not in numbers]
+        for part, own in ((group, numbers), (others, rest)):
+            np.testing.assert_array_equal(part.set_points, np.concatenate([runs[k].set_points for k in own]))
+
+
+@pytest.mark.parametrize("other", [True, False])
+@pytest.mark.parametrize("rows", [249, 250])
+@pytest.mark.parametrize("moved", [True, False])
+def test_another_experiment_is_left_out_and_trained_on_in_turn(
+    other: bool, rows: int, moved: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train, hold_out = neck_recording(700), neck_recording(rows, seed=9)
+    if not moved:
+        monkeypatch.setattr(_left_out, "time_constant_of", lambda _: None)
+    found = folds(train, hold_out, other_excitation=other)
+    names = [part.name for fold in found for part in fold.judged]
+    own = ["largest motions", "fastest motions"] * moved
+    back = ["trained on the other"] * (rows == 250)
+    assert names == [*own, *(["other excitation", *back] if other else [])]
+    if other:
+        last = found[-1 if back else 0].judged[-1].recording
+        np.testing.assert_array_equal(last.outputs, train.outputs if back else hold_out.outputs)
+        assert np.isnan(found[0].train.outputs).any() == moved
+
+
+def test_fits_of_rows_left_out_are_of_each_output_there_and_of_nothing_that_rests_or_diverges() -> None:
+    rng = np.random.default_rng(4)
+    Y = 0.1 * rng.standard_normal((400, 2))
+    free = Y + 0.03 * rng.standard_normal((400, 2))
+    recording, rows = of_runs([400], rng.standard_normal((400, 3)), Y), rng.random(400) < 0.5
+    model: Any = SimpleNamespace(robot=Robot.preset("neck"), simulate=lambda _: np.c_[free, np.zeros(400)])
+    fits, error = Judged("x", recording, rows).fits(model)
+    by_hand = [100.0 * (1.0 - np.linalg.norm((y - z)[rows]) / np.linalg.norm(y[rows] - y[rows].mean()))
+               for y, z in zip(Y.T, free.T, strict=True)]  # fmt: skip
+    assert list(fits.items()) == [("pitch", pytest.approx(by_hand[0])), ("roll", pytest.approx(by_hand[1]))]
+    assert 0.0 < error < 5.0
+    still = of_runs([400], recording.set_points, Y * [1.0, 0.0])
+    fits, alone = Judged("x", still, rows).fits(model)
+    assert fits["pitch"] == pytest.approx(by_hand[0])
+    assert math.isnan(fits["roll"])
+    assert alone > 0.0
+    fits, nothing = Judged("x", of_runs([400], recording.set_points, 0.0 * Y), rows).fits(model)
+    assert all(map(math.isnan, (*fits.values(), nothing)))
+    for lost in (math.nan, math.inf):
+        free[7, 1] = lost
+        fits, error = Judged("x", recording, rows).fits(model)
+        assert fits == dict.fromkeys(("pitch", "roll"), -math.inf)
+        assert math.isnan(error)
+
+
+def test_the_standard_error_is_the_spread_of_the_mean_fit_over_recordings_like_this_one() -> None:
+    """Independent blocks of 100 rows: what resampling tells of one recording is the spread over many."""
+    rng = np.random.default_rng(5)
+
+    def one() -> tuple[np.ndarray, np.ndarray]:
+        y = rng.standard_normal((3000, 2))
+        louder = np.repeat(rng.uniform(0.1, 0.9, 30), 100)[:, None]
+        return y, y + louder * rng.standard_normal((3000, 2))
+
+    def mean_fit(y: np.ndarray, free: np.ndarray) -> float:
+        return float(np.mean([nrmse_fit(a, b) for a, b in zip(y.T, free.T, strict=True)]))
+
+    many = [one() for _ in range(100)]
+    told = np.mean([standard_error(*each) for each in many[:20]])
+    # 100 recordings tell a spread to 7 %, and 30 blocks understate it by a few percent.
+    assert told == pytest.approx(np.std([mean_fit(*each) for each in many]), rel=0.25)
+    y, free = many[0]
+    # Larger errors of one block alone make it less sure; blocks that err alike do not.
+    worse = free.copy()
+    worse[:100] += 2.0 * rng.standard_normal((100, 2))
+    assert standard_error(y, worse) > 1.3 * standard_error(y, free)
+    assert standard_error(y, y + 0.1) < 0.3 * standard_error(y, free)
+    # What was not measured has no part in it.
+    some = y.copy()
+    some[::2] = np.nan
+    assert standard_error(some, free) == pytest.approx(standard_error(y, free), rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("factors", "other"),
+    [((1.0,), False), ((1.0, 1.24), False), ((1.0, 1.26), True), ((1.26, 1.0), True), ((1.0, 1.1, 1.3), True)],
+)
+def test_runs_whose_spread_differs_by_a_quarter_are_other_motions(factors: tuple[float, ...], other: bool) -> None:
+    U = np.random.default_rng(6).standard_normal((100, 3))
+    runs = [U * [1.0, factor, 1.0] for factor in factors]
+    assert other_motion(of_runs([100] * len(runs), np.concatenate(runs))) is other
+    # Also where it is their speed alone that differs.
+    slow = np.sort(U, axis=0)
+    assert other_motion(of_runs([100, 100], np.concatenate([slow, slow]))) is False
+    assert other_motion(of_runs([100, 100], np.concatenate([U, slow])))
+    # A motor that rests in both is in no motion, and a run of one row is none.
+    still = np.zeros((200, 3))
+    assert not other_motion(of_runs([100, 100], still))
+    assert not other_motion(of_runs([1], still[:1]))
