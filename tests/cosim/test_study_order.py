@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import BrokenExecutor, CancelledError, Future
 from itertools import permutations
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,10 +14,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from softneck.core import DataError, SettingsError, metric_of
+from softneck.core import DataError, FileFormatError, OutputFileError, SettingsError, metric_of
 from softneck.cosim import group_runs, pareto_front, rank, worst_runs
-from softneck.cosim.studies import _run_study
-from softneck.cosim.studies._store import _spread, read_tables
+from softneck.cosim.studies import _run_study, _study
+from softneck.cosim.studies._store import _spread, pareto_rows, read_tables
 from softneck.cosim.studies._study import Vary
 from softneck.loop import metric_names
 from softneck.robot import Robot
@@ -144,3 +145,212 @@ def test_only_finite_runs_that_did_not_fail_are_on_the_front() -> None:
     runs = runs_of((1.0, 2.0, 0.5, math.nan, math.inf, 3.0), errors=["", "", "gone", "", "", ""])
     runs["other"] = [3.0, 1.0, 0.1, 0.0, 0.0, 4.0]
     assert pareto_front(runs, [ERROR, "other"])["run"].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("columns", [1, 2, 3])
+def test_a_front_is_what_none_beats_in_whatever_order_runs_and_objectives_stand(columns: int) -> None:
+    values = np.random.default_rng(columns).integers(0, 5, (60, columns)).astype(float)
+    beaten = [any((other <= one).all() and (other < one).any() for other in values) for one in values]
+    for order in (slice(None), slice(None, None, -1)):
+        np.testing.assert_array_equal(pareto_rows(values[order]), ~np.array(beaten)[order])
+        np.testing.assert_array_equal(pareto_rows(values[:, order]), ~np.array(beaten))
+    assert pareto_rows(np.empty((0, columns))).tolist() == []
+
+
+@pytest.mark.parametrize("absent", ["run", "holds", "error"])
+def test_a_file_of_runs_without_a_column_or_with_others_is_refused(absent: str, tmp_path: Path) -> None:
+    whole, other = tmp_path / "a.csv", tmp_path / "b.csv"
+    runs_of((1.0, 2.0)).to_csv(whole, index=False)
+    runs_of((1.0, 2.0)).drop(columns=absent).to_csv(other, index=False)
+    vary = {"kind": Vary("choices", labels=("a",))}
+    with pytest.raises(FileFormatError, match=f"no column `{absent}`"):
+        read_tables([whole, other], vary)
+    runs_of((1.0, 2.0)).assign(more=1.0).to_csv(other, index=False)
+    with pytest.raises(FileFormatError, match="has other columns than"):
+        read_tables([whole, other], vary)
+    other.write_text(whole.read_text() + "3,a,1.0,,,7\n")  # a row that is longer than the header
+    with pytest.raises(FileFormatError, match="cannot be read"):
+        read_tables([other], vary)
+
+
+# -- workers that die --------------------------------------------------------------------------------------------------
+
+
+class Pool:
+    """An executor in this process: chunks with runs of `kills` break it, others end as `answer` says."""
+
+    def __init__(self, answer: Any, kills: Any = (), refuses: int = 0) -> None:
+        self.answer, self.kills, self.refuses, self.chunks = answer, set(kills), refuses, list[list[int]]()
+        self.starts: list[int] = []
+
+    def submit(self, _: Any, chunk: Any) -> Future:
+        runs = [point.run for point in chunk.points]
+        if self.refuses > 0:
+            self.refuses -= 1
+            raise BrokenExecutor
+        self.chunks.append(runs)
+        future: Future = Future()
+        try:
+            if self.kills.intersection(runs):
+                raise BrokenExecutor
+            future.set_result(self.answer(runs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+    def shutdown(self, **how: Any) -> None:
+        assert how == {"wait": True, "kill_workers": True}
+
+    def start(self, size: int) -> Any:
+        self.starts.append(size)
+        return self
+
+
+class Rows:
+    """A store in memory."""
+
+    def __init__(self, done: Any = ()) -> None:
+        self.done, self.rows = set(done), dict[int, str]()
+
+    def add(self, rows: Any) -> None:
+        assert not self.rows.keys() & {row["run"] for row in rows}, "a run is written once"
+        self.rows |= {row["run"]: row["error"] for row in rows}
+        self.done.update(self.rows)
+
+
+def finished(runs: list[int], seconds: float | None = 0.01) -> list[dict[str, Any]]:
+    return [{"run": run, "error": "", "seconds": seconds} for run in runs]
+
+
+def run_all(pool: Pool, count: int = 12, done: Any = (), size: int = 2) -> tuple[Rows, list[tuple[float, str]]]:
+    """Return what is written of a study of so many runs, and what is said of its course."""
+    points = [SimpleNamespace(run=k, sample=0, seed=0, labels={}) for k in range(count)]
+    study: Any = SimpleNamespace(points=points, digest="d", loop={}, folder=Path(), metrics=())
+    store, said = Rows(done), list[tuple[float, str]]()
+    workers = _run_study.WorkerPool(size, pool, pool.start)  # pyright: ignore[reportArgumentType]
+    _run_study._StudyRun(study, store, workers, lambda *told: said.append(told)).run()  # pyright: ignore[reportArgumentType]
+    return store, said
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_each_run_that_is_left_is_run_once_and_the_course_is_said(size: int) -> None:
+    pool = Pool(finished)
+    store, said = run_all(pool, done=(0, 5), size=size)
+    assert sorted(run for chunk in pool.chunks for run in chunk) == [k for k in range(12) if k not in (0, 5)]
+    assert set(store.rows.values()) == {""}
+    shares = [share for share, _ in said]
+    assert shares == sorted(shares)
+    assert said[-1] == (1.0, "12 of 12")
+    assert pool.starts == []
+    assert run_all(Pool(finished), done=range(12))[1] == []
+
+
+@pytest.mark.parametrize("kills", [(3,), (0, 11), tuple(range(12))])
+def test_a_run_that_kills_its_worker_twice_alone_is_named_and_no_other_is_lost(kills: tuple[int, ...]) -> None:
+    pool = Pool(finished, kills)
+    store, said = run_all(pool)
+    died = "its worker process died 2 times with it alone"
+    assert store.rows == {run: died if run in kills else "" for run in range(12)}
+    assert [pool.chunks.count([run]) >= 2 for run in kills] == [True] * len(kills)
+    assert said[-1] == (1.0, f"12 of 12, {len(kills)} failed")
+    # New workers after each death: one alone to find which it was, all of them where runs are left.
+    assert set(pool.starts) <= {1, 2}
+    assert pool.starts[0] == 1
+
+
+def test_a_pool_that_breaks_when_work_is_given_loses_nothing() -> None:
+    pool = Pool(finished, refuses=2)
+    assert run_all(pool)[0].rows == dict.fromkeys(range(12), "")
+    assert pool.starts[:2] == [1, 1]
+    # What was ready when another worker died is kept and not run again.
+    ends, lost = Pool(finished, kills=(1,)), []
+    store, _ = run_all(ends, count=4, size=4)
+    assert store.rows.keys() == {0, 1, 2, 3}
+    assert [ends.chunks.count([run]) for run in (0, 2, 3)] == [1, 1, 1]
+    assert lost == []
+
+
+def test_a_worker_that_fails_otherwise_costs_the_run_that_is_alone_with_it() -> None:
+    def answer(runs: list[int]) -> Any:
+        if 7 in runs:
+            raise ValueError("it cannot be sent")
+        return finished(runs)
+
+    store, _ = run_all(Pool(answer), count=40)
+    assert store.rows == {k: "its worker failed: ValueError: it cannot be sent" if k == 7 else "" for k in range(40)}
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [(CancelledError(), "the Dask scheduler is gone"), (OutputFileError("disk is full"), "disk is full")],
+)
+def test_what_ends_a_study_is_raised_and_no_run_is_blamed_for_it(error: Exception, said: str) -> None:
+    def answer(_: list[int]) -> Any:
+        raise error
+
+    with pytest.raises(OutputFileError, match=said):
+        run_all(Pool(answer))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "ended", "left", "wanted"),
+    [(0.0, 0, 100, 1), (0.1, 1, 800, 5), (1.0, 1, 800, 1), (0.1, 1, 16, 2), (0.1, 1, 17, 3), (1e-9, 1, 9000, 200),
+     (0.1, 10, 8000, 50), (0.1, 1, 1, 1), (0.0, 5, 9000, 1)],
+)  # fmt: skip
+def test_a_chunk_takes_half_a_second_and_leaves_each_worker_its_share(
+    seconds: float, ended: int, left: int, wanted: int
+) -> None:
+    """A quarter of what each of two workers has left at most, and never more than 200 runs."""
+    study: Any = SimpleNamespace(points=[None] * left, digest="")
+    store, workers = Rows(), _run_study.WorkerPool(2, Pool(finished))  # pyright: ignore[reportArgumentType]
+    course = _run_study._StudyRun(study, store, workers, lambda *_: None)  # pyright: ignore[reportArgumentType]
+    course._seconds, course._ended = seconds, ended
+    assert course._chunk() == wanted
+
+
+def test_two_chunks_for_each_worker_are_out_and_one_alone_after_a_death() -> None:
+    class Slow(Pool):
+        def submit(self, _: Any, chunk: Any) -> Future:
+            self.chunks.append([point.run for point in chunk.points])
+            return Future()
+
+    pool = Slow(finished)
+    study: Any = SimpleNamespace(points=[SimpleNamespace(run=k) for k in range(99)], digest="", loop={}, folder=Path(),
+                                 metrics=())  # fmt: skip
+    course = _run_study._StudyRun(study, Rows(), _run_study.WorkerPool(3, pool, pool.start), lambda *_: None)  # pyright: ignore[reportArgumentType]
+    course._submit_next()
+    assert pool.chunks == [[k] for k in range(6)]
+    course._submit_next()
+    assert len(pool.chunks) == 6
+    course._suspects.extend([50, 51])
+    course._submit_next()  # not while others run
+    assert len(pool.chunks) == 6
+    course._running.clear()
+    course._submit_next()
+    assert (pool.chunks[-1], list(course._suspects)) == ([50], [51])
+
+
+def test_parts_of_one_class_with_other_numbers_are_other_studies(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Mine:
+        def __init__(self, gain: float) -> None:
+            self.gain = gain
+
+    for steps in (True, False):
+        monkeypatch.setattr(_study, "own_object", lambda value, steps=steps: object() if steps else value)
+        one, same, other = (_study._plain(Mine(gain)) for gain in (1.0, 1.0, 2.0))
+        assert one == same
+        # Of what does not step its class alone is known.
+        assert (one != other) is steps
+
+
+def test_a_loop_in_a_study_file_starts_at_its_folder_and_one_beside_it_too(tmp_path: Path) -> None:
+    loop = '"x.npz"'
+    text = 'runs = 2\n[loop]\nduration_s = 1.0\nplant = "paper"\ncontroller = {controller}\n[loop.reference]\n'
+    text += 'kind = "step"\npitch_deg = 5.0\nat_s = 0.2\n[vary]\n"reference.pitch_deg" = {{ uniform = [1.0, 2.0] }}\n'
+    (tmp_path / "study.toml").write_text(text.format(controller=loop))
+    made = _study.load_study(tmp_path / "study.toml")
+    assert made.folder == tmp_path
+    (tmp_path / "inner").mkdir()
+    (tmp_path / "inner" / "loop.toml").write_text("duration_s = 1.0\n")
+    told = {"loop": "inner/loop.toml", "runs": 2}
+    assert _study._from_table(tmp_path / "study.toml", told).folder == tmp_path / "inner"

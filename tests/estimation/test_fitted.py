@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from softneck.core import load
-from softneck.estimation import KalmanObserver, KalmanSettings
+from softneck.estimation import KalmanObserver, KalmanSettings, _observer
 from softneck.estimation._observer import (
     _estimate_lag,
     _unexplained_share,
@@ -141,3 +143,65 @@ def test_a_lag_is_that_of_all_outputs_and_none_at_the_end_of_the_search() -> Non
         z[:, axis] = np.cumsum(rng.standard_normal(500))
         assert _unexplained_share([(z, way)], 3.0) > 0.2
         assert _estimate_lag([(z, way)], TS) is None
+
+
+@pytest.mark.parametrize("named", [[], ["sensor"], ["sensor_delay"], ["sensor", "sensor_delay"]])
+@pytest.mark.parametrize("data", [None, "one", ["one", "two"], ("one", "two")])
+def test_an_observer_is_fitted_only_to_data_and_never_in_what_is_named(
+    data: Any, named: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = SimpleNamespace(noise_names=("measurement", "model", "bias"))
+    asked: list[Any] = []
+    monkeypatch.setattr(_observer, "make_settings", lambda _, settings: settings)
+    monkeypatch.setattr(_observer, "design_observer", lambda *_: made)
+    monkeypatch.setattr(_observer, "open_recording", lambda part, robot: (part, robot))
+    monkeypatch.setattr(
+        _observer,
+        "fit_levels_and_delays",
+        lambda *given, **how: asked.append((given, how)) or SimpleNamespace(observer=1),
+    )
+    found = _observer.observer("model", data=data, robot="robot", **dict.fromkeys(named, 0))  # pyright: ignore[reportArgumentType]
+    if data is None:
+        assert found is made
+        assert asked == []
+        return
+    assert found == 1
+    rows = [(part, "robot") for part in ([data] if isinstance(data, str) else data)]
+    fixed = ("measurement",) if "sensor" in named else ()
+    assert asked == [((made, rows), {"fixed": fixed, "delay": "sensor_delay" not in named})]
+
+
+@pytest.mark.parametrize("given", [None, 0.0, 0.06])
+@pytest.mark.parametrize("form", ["model", "gyro"])
+@pytest.mark.parametrize("bends", [True, False])
+@pytest.mark.parametrize("sensor", [None, 0.0, 0.04])
+def test_a_linear_filter_predicts_over_the_delay_of_the_sensor_else_of_the_robot_and_says_whose_it_is(
+    given: float | None, form: str, bends: bool, sensor: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @dataclass(frozen=True)
+    class Made:
+        delay: float | None
+        delay_source: str = ""
+
+    @dataclass(frozen=True)
+    class Settings:
+        sensor_delay: float | None
+        form: str
+        sensor: str = "usual"
+
+        def design(self, known: Any) -> Made:
+            assert known == "known"
+            return Made(self.sensor_delay)
+
+    monkeypatch.setattr(_observer, "load_for_robot", lambda *_: "known")
+    monkeypatch.setattr(_observer, "is_nonlinear", lambda _: bends)
+    monkeypatch.setattr(_observer, "find_sensor", lambda _: SimpleNamespace(delay=sensor))
+    monkeypatch.setattr(_observer, "robot_of", lambda _: SimpleNamespace(delay_s=0.1))
+    settings: Any = Settings(given, form)
+    found = _observer.design_observer(settings, "model", None)
+    if given is not None or form == "gyro" or bends:
+        assert found == Made(given)
+    elif sensor is None:
+        assert found == Made(0.1, "robot")
+    else:
+        assert found == Made(sensor, "sensor" if sensor else "")

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.estimation import KalmanObserver, consistency, fit_noise
-from softneck.estimation._noise import find_outliers, look_ahead_error
+from softneck.estimation import KalmanObserver, _noise, consistency, fit_noise
+from softneck.estimation._noise import cost_of, find_outliers, look_ahead_error
 from softneck.estimation._offline import measured_angles
 from softneck.signals import Recording
 
@@ -176,3 +176,89 @@ def test_consistency_counts_what_the_gate_refused() -> None:
     found = consistency(filtered, record, settle=50)
     # 150 rows but for ten without a measurement, three of ten of them refused; a refused one has no part in the mean.
     assert (found.rejected, found.taken, found.mean, found.inside) == (42, 98, 2.0, 1.0)
+
+
+@pytest.mark.parametrize("fixed", [(), ("measurement_noise_std",)])
+def test_levels_that_are_found_have_the_likelihood_that_is_told(
+    fixed: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The search is replaced by a step of a tenth of a decade; what was left out is counted and has no part."""
+    record = changed(drawn(rows=300), [100, 150], 1.0, "pitch_measured")
+    start = observer_of()
+
+    def step(cost: Any, begin: np.ndarray, free: np.ndarray) -> Any:
+        found = begin + 0.1 * free
+        return found, cost.of(found), np.array([False, True, False])
+
+    monkeypatch.setattr(_noise, "_maximise_likelihood", step)
+    found = fit_noise(start, record, fixed=fixed)
+    factors = [1.0 if name in fixed else 10.0**0.1 for name in start.noise_names]
+    np.testing.assert_allclose(found.noise, np.array(TRUE) * factors, rtol=1e-12)
+    assert found.observer.noise == found.noise
+    assert (found.start, found.names, found.at_bound) == (TRUE, start.noise_names, (start.noise_names[1],))
+    cost = cost_of(start, [record])
+    assert found.log_likelihood == (-0.5 * cost.of(np.log10(TRUE)), -0.5 * cost.of(np.log10(found.noise)))
+    spoilt = find_outliers(measured_angles(record))
+    assert (found.outliers, found.rows) == (int(spoilt.sum()), 300 - _noise.SETTLE - int(spoilt[_noise.SETTLE :].sum()))
+    twice = fit_noise(start, [record, record], fixed=fixed)
+    assert (twice.outliers, twice.rows) == (2 * found.outliers, 2 * found.rows)
+    assert twice.log_likelihood == pytest.approx(found.log_likelihood, rel=1e-12)  # per measurement
+    # Two hundred measurements are enough.
+    assert fit_noise(start, drawn(rows=250), fixed=fixed).rows == 200
+    with pytest.raises(DataError, match="got 199"):
+        fit_noise(start, drawn(rows=249), fixed=fixed)
+
+
+@pytest.mark.parametrize("free", [[True, True, True], [True, False, True], [False, True, False]])
+def test_levels_of_least_cost_are_found_within_two_decades_and_an_end_is_told(free: list[bool]) -> None:
+    start, best = np.array([-3.0, -2.0, -1.0]), np.array([-2.4, -5.0, -0.1])
+    cost: Any = SimpleNamespace(of=lambda levels: float(((levels - best) ** 2).sum()))
+    found, least, at_bound = _noise._maximise_likelihood(cost, start, np.array(free))
+    expected = np.where(free, np.clip(best, start - 2.0, start + 2.0), start)
+    np.testing.assert_allclose(found, expected, atol=2e-3)  # a thousandth of a decade ends the search
+    assert least == pytest.approx(cost.of(found))
+    assert at_bound.tolist() == [False, free[1], False]
+
+
+def test_an_outlier_is_six_deviations_from_its_neighbours_and_three_rows_are_the_least() -> None:
+    y = np.array([0.0, 1.0] * 20)[:, None]  # the median change is 1
+    for far, spoilt in ((9.8, False), (10.0, True), (-7.8, False), (-8.0, True)):
+        z = y.copy()
+        z[20] = far
+        # Both neighbours are at 1, and 6 times 1.4826 is 8.9.
+        assert find_outliers(z)[20] == spoilt
+    assert not find_outliers(np.array([[0.0], [1e9]])).any()
+    still = np.zeros((9, 2))
+    still[4, 1] = 1e-3
+    assert np.flatnonzero(find_outliers(still)).tolist() == [4]
+    still[2] = np.nan  # what did not come is no neighbour
+    assert np.flatnonzero(find_outliers(still)).tolist() == [4]
+
+
+@pytest.mark.parametrize("late", [0.0, 1.0, 1.5])
+def test_the_error_ahead_is_that_of_estimates_to_what_was_measured_later(late: float) -> None:
+    """A filter that tells the row's number, of an output that is it: it is `late` samples behind, in all or in gaps."""
+    rows, seen = 200, []
+    record = recording(rows=rows)
+    ramp = 1e-3 * np.arange(rows)
+    record = record.with_channels(pitch_measured=ramp, roll_measured=2.0 * ramp)
+
+    def estimate(run: Recording) -> Any:
+        seen.append(np.isnan(run.channels["pitch_measured"]))
+        told = np.column_stack([ramp, 2.0 * ramp])
+        told[77, 0] += 0.5  # in a gap
+        told[60, 0] += 0.7  # in none
+        return SimpleNamespace(outputs=told)
+
+    observer: Any = SimpleNamespace(estimate=estimate, lead=0.02 * late, sample_time=0.02)
+    found = look_ahead_error(observer, record)
+    assert found == look_ahead_error(observer, record, 0.02 * late)
+    row = np.arange(rows)
+    gaps = (row >= 50) & (row % 25 >= 20)
+    np.testing.assert_array_equal(seen[0], gaps)
+    counted = np.flatnonzero(gaps if late < 1.0 else row >= 50)
+    counted = counted[counted + math.ceil(late) < rows]
+    errors = np.outer(np.full(counted.size, -1e-3 * late), [1.0, 2.0])
+    errors[np.flatnonzero(counted == 77)[:, None], 0] += 0.5
+    errors[np.flatnonzero(counted == 60)[:, None], 0] += 0.7
+    assert found == pytest.approx(math.sqrt((errors**2).mean()), rel=1e-9)

@@ -247,7 +247,7 @@ def pareto_rows(values: Matrix) -> np.ndarray:
     """Return whether each row of (n, m) is dominated by no other; in lexical order only the front can dominate."""
     keep = np.zeros(len(values), dtype=bool)
     front = np.empty((0, values.shape[1]))
-    for i in np.lexsort(values.T[::-1]):
+    for i in np.lexsort(values.T):
         beaten = (front <= values[i]).all(axis=1) & (front < values[i]).any(axis=1)
         if not beaten.any():
             keep[i] = True

@@ -227,7 +227,7 @@ def standard_error(y: Matrix, outputs: Matrix) -> float:
     # Any generator will do, but the same choice must give the same answer.
     drawn = np.random.default_rng(0).integers(len(wrong), size=(_BOOTSTRAP_RESAMPLES, len(wrong)))
     ratio = wrong[drawn].sum(axis=1) / np.maximum(spread[drawn].sum(axis=1), 1e-300)
-    return float((100.0 * (1.0 - np.sqrt(ratio))).mean(axis=1).std())
+    return float(100.0 * np.sqrt(ratio).mean(axis=1).std())
 
 
 def _block_sums(squares: Matrix) -> Matrix:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -289,3 +290,164 @@ def test_a_run_of_less_than_a_segment_is_to_be_longer() -> None:
     # The shortest segment has 2.5 time constants of 2.4 s: 300 rows of 20 ms.
     with pytest.raises(DataError, match="no two segments with outputs; record longer"):
         _draws._Motions.of(neck_recording(256), Model(kind="rls", sample_time=0.02, arrays={}), 12.0)
+
+
+# -- what is held out -------------------------------------------------------------------------------------------------
+
+
+def held_out(lengths: list[int], y: np.ndarray) -> Recording:
+    """Return runs that follow each other, with these outputs."""
+    whole, starts = neck_recording(len(y)), np.cumsum([0, *lengths])
+    whole = whole.with_channels(pitch=y[:, 0], roll=y[:, 1])
+    return _draws.concatenate([whole.rows(a, b) for a, b in itertools.pairwise(starts)])
+
+
+RLS = Model(kind="rls", sample_time=0.02, arrays={})
+
+
+def test_segments_are_parts_of_a_run_by_the_largest_motion_of_an_output() -> None:
+    """Waves of 50 rows in segments of two seconds; runs begin a segment of their own, without their first 25 rows."""
+    sizes = np.array([0.2, 0.2 * 0.59, 0.2 * 0.61, 0.2 * 0.24, 0.2 * 0.26])
+    lengths = [200, 250]
+    number = np.concatenate([np.arange(200) // 100, 2 + np.arange(250) // 100])
+    wave = np.sin(2.0 * np.pi * np.arange(450) / 50.0)
+    y = np.column_stack([0.01 * wave, sizes[number] * wave])
+    y[130, 0] = np.nan  # a row that misses one output
+    found = _draws._Motions.of(held_out(lengths, y), RLS, 1.0)
+    expected = number.copy()
+    expected[[*range(25), *range(200, 225), 130]] = -1
+    np.testing.assert_array_equal(found.groups, expected)
+    # 25 rows are half a wave, and 50 rows at least are left of each segment.
+    np.testing.assert_allclose(found.motion, sizes, rtol=3e-3)
+    assert found.classes.tolist() == [2, 1, 2, 0, 1]
+    assert found.noise.shape == (2,)
+    with pytest.raises(DataError, match="no two segments"):
+        _draws._Motions.of(held_out([450], np.where(np.arange(450)[:, None] < 100, y, np.nan)), RLS, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("lengths", "second", "parts"),
+    [([200], 1.0, None), ([400], 1.0, [(300, 100)]), ([180], 1.0, None),
+     ([400, 100, 800], 1.0, [(300, 100), (600, 200)]),
+     # 150 s of a neck's time are 7,500 rows; of a quicker robot fewer, though no fewer than eight warm-ups.
+     ([8000], 1.0, [(5625, 1875)]), ([8000], 0.5, [(2812, 938)]), ([8000], 0.001, [(150, 50)])],
+)  # fmt: skip
+def test_the_last_quarter_of_each_run_is_held_out(lengths: list[int], second: float, parts: Any) -> None:
+    recording = held_out(lengths, 0.01 * np.random.default_rng(0).standard_normal((sum(lengths), 2)))
+    if parts is None and lengths != [200]:
+        with pytest.raises(DataError, match="no run has 200 rows"):
+            _draws._split(recording, second)
+        return
+    train, held = _draws._split(recording, second)
+    assert [(len(a), len(b)) for a, b in zip(train.runs(), held.runs(), strict=True)] == (parts or [(150, 50)])
+    np.testing.assert_array_equal(train.runs()[0].outputs, recording.runs()[0].outputs[: len(train.runs()[0])])
+    last, rows = [run for run in recording.runs() if len(run) > 150][-1], len(train.runs()[-1])
+    np.testing.assert_array_equal(held.runs()[-1].outputs, last.outputs[rows : rows + len(held.runs()[-1])])
+
+
+def test_what_is_left_over_is_of_the_nearest_draw_of_each_segment() -> None:
+    rng = np.random.default_rng(1)
+    Y = rng.normal(size=(3, 10, 2))
+    y = np.concatenate([Y[2, :5], Y[0, 5:]])
+    for draws in (Y, Y[::-1]):
+        share, _ = segments(y).disturbance(draws)
+        np.testing.assert_array_equal(share, 0.0)
+    # A nearer draw never leaves more, and one that diverged is near to nothing.
+    far, lost = segments(y).disturbance(Y[:1])[0], Y.copy()
+    lost[2, 3, 1] = np.nan
+    assert (far > 0.0).any()
+    assert (segments(y).disturbance(lost)[0] > 0.0).any()
+    spoilt = Y.copy()
+    spoilt[1] = np.nan
+    np.testing.assert_array_equal(segments(y).disturbance(spoilt)[0], 0.0)
+
+
+@pytest.mark.parametrize(("keep", "share", "noise"), [(0.9, 0.2, 0.0), (0.5, 0.4, 0.0), (0.95, 0.3, 0.02)])
+def test_share_and_colour_of_a_disturbance_are_found(keep: float, share: float, noise: float) -> None:
+    """`d[k+1] = keep d[k] + share dy[k] n[k]` around a draw, in a sensor's noise that is known."""
+    rng, rows = np.random.default_rng(2), 8000
+    draw = np.cumsum(0.05 * rng.standard_normal((rows, 2)), axis=0)
+    moves, d = np.diff(draw, axis=0, prepend=draw[:1]), np.zeros((rows, 2))
+    for k in range(1, rows):
+        d[k] = keep * d[k - 1] + share * moves[k] * rng.standard_normal(2)
+    y = draw + d + noise * rng.standard_normal((rows, 2))
+    groups, nothing = np.repeat([0, 1], rows // 2), SimpleNamespace()
+    motions = _draws._Motions(nothing, nothing, y, groups, np.ones(2), np.array([1, 2]), np.full(2, noise))  # pyright: ignore[reportArgumentType]
+    found, colour = motions.disturbance(np.array([draw, draw + 9.0]))
+    # 8,000 rows with a colour of 0.95 are some 200 that are independent: a deviation to 5 %.
+    np.testing.assert_allclose(found, share, rtol=0.15)
+    assert colour == pytest.approx(keep, abs=0.04)
+    # A band of 1.96 deviations of it covers 95 % of normal values.
+    rows_of = motions.coverage(np.array([draw]), found, colour)
+    assert [row["covered"] for row in rows_of] == pytest.approx([0.95, 0.95], abs=0.02)
+    assert [(row["class"], row["segments"]) for row in rows_of] == [("middle", 1), ("large", 1)]
+
+
+def test_the_variance_of_a_disturbance_follows_its_recursion() -> None:
+    moves, keep = np.array([[1.0], [0.0], [2.0], [0.0]]), 0.5
+    # v[k] = keep^2 v[k-1] + dy[k]^2
+    np.testing.assert_allclose(_draws._filtered(moves, keep)[:, 0], [1.0, 0.25, 4.0625, 1.015625])
+
+
+def test_coverage_tells_the_largest_motion_the_mean_width_and_the_number_of_segments() -> None:
+    y = np.zeros((15, 1))
+    Y = np.stack([y, y + np.repeat([0.2, 0.4, 1.0], 5)[:, None]])
+    groups, nothing = np.repeat([0, 1, 2], 5), SimpleNamespace()
+    motions = _draws._Motions(nothing, nothing, y, groups, np.array([0.3, 0.5, 1.0]), np.array([1, 1, 2]), np.zeros(1))  # pyright: ignore[reportArgumentType]
+    small, large = motions.coverage(Y, np.zeros(1), 0.0)
+    assert small == {"class": "middle", "motion": 0.5, "covered": 1.0, "width": pytest.approx(0.15), "segments": 2}
+    assert (large["width"], large["segments"], large["motion"]) == (pytest.approx(0.5), 1, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [({"count": 1}, "count"), ({"count": 10_001}, "count"), ({"seed": -1}, "seed"), ({"seed": 2**31 - 1}, "seed")],
+)
+def test_numbers_of_draws_and_seeds_have_their_ends(
+    asked: dict[str, int], said: str, recordings: list[Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(SettingsError, match=said):
+        make_draws(recordings, **asked)
+    monkeypatch.setattr(_draws, "_sources", lambda *_: (_ for _ in ()).throw(KeyError("fitted")))
+    for count, seed in ((2, 0), (10_000, 2**31 - 2)):
+        with pytest.raises(KeyError, match="fitted"):
+            make_draws(recordings[0], count=count, seed=seed)
+
+
+def test_a_search_sees_its_own_draws_and_no_more(made: Callable[..., Draws]) -> None:
+    found = made()
+    every = bits(found.for_search())
+    assert len(every) == 8
+    assert bits(found.for_search(3)) == every[:3]
+    assert bits(found.for_search(99)) == every
+    assert [len(found.for_certificate(k)) for k in (1, 6)] == [3, 3]
+    for attempt in (0, 7):
+        with pytest.raises(SettingsError):
+            found.for_certificate(attempt)
+    first, *rows = found.summary(1.0, "rad")
+    assert first.startswith(f"draws: 3 of kind play for each of 6 certificates, seed 0; deviations of the fit times "
+                            f"{found.factor:g}, and a disturbance of {100.0 * found.share.max():.2g} %")  # fmt: skip
+    assert len(rows) == len(found.coverage)
+    row = found.coverage[-1]
+    assert f"{100.0 * row['width'] / row['motion']:.0f} % of the motion" in rows[-1]
+
+
+def test_the_making_of_draws_says_how_far_it_is_and_refuses_what_has_no_simulation(
+    made: Callable[..., Draws], recordings: list[Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = PlayDraws.fit(_draws._split(_draws.concatenate(recordings), 1.0)[0], settings=QUICK)
+    said: list[float] = []
+
+    def sources(_: Any, progress: Any) -> list[Any]:
+        for share in (0.0, 1.0):
+            progress(share, "fit")
+        return [source]
+
+    monkeypatch.setattr(_draws, "_sources", sources)
+    monkeypatch.setattr(_draws, "_FACTORS", (1.0, 2.0))
+    monkeypatch.setattr(_draws, "_CALIBRATION_DRAWS", 4)
+    make_draws(recordings, count=2, progress=lambda share, _: said.append(share))
+    assert said == pytest.approx([0.0, 0.7, 0.7, 0.775, *(0.85 + 0.15 * np.arange(20) / 20)])
+    monkeypatch.setattr(_draws._Motions, "simulate", lambda *_: np.full((4, 450, 2), np.nan))
+    with pytest.raises(DataError, match="no draw has a finite simulation"):
+        make_draws(recordings, count=2)
