@@ -168,7 +168,7 @@ class Draws(ReprMixin):
             share=share, keep=float(header["keep"]), noise=noise, level=float(header["level"]),
             coverage=list(header["coverage"]), conditions=dict(header["conditions"]),
         )  # fmt: skip
-        for number in range(min(size)):
+        for number in range(*size):
             check_arrays(model.kind, found._draw(number).arrays)
         return found
 

@@ -352,6 +352,13 @@ def test_what_is_left_over_is_of_the_nearest_draw_of_each_segment() -> None:
     for draws in (Y, Y[::-1]):
         share, _ = segments(y).disturbance(draws)
         np.testing.assert_array_equal(share, 0.0)
+    # Each of three segments has its own, and rows of none have none.
+    groups = np.array([-1, 0, 0, 0, 1, 1, 1, 2, 2, 2])
+    each = np.concatenate([Y[2, :1] + 9.0, Y[2, 1:4], Y[0, 4:7], Y[1, 7:]])
+    three = replace(segments(each), groups=groups, motion=np.ones(3), classes=np.zeros(3, dtype=int))
+    np.testing.assert_array_equal(three.disturbance(Y)[0], 0.0)
+    # Draws that do not move leave a share that is a number.
+    assert np.isfinite(segments(y).disturbance(np.zeros((2, 10, 2)))[0]).all()
     # A nearer draw never leaves more, and one that diverged is near to nothing.
     far, lost = segments(y).disturbance(Y[:1])[0], Y.copy()
     lost[2, 3, 1] = np.nan
@@ -407,7 +414,7 @@ def test_numbers_of_draws_and_seeds_have_their_ends(
     asked: dict[str, int], said: str, recordings: list[Recording], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(SettingsError, match=said):
-        make_draws(recordings, **asked)
+        make_draws(recordings, **asked)  # pyright: ignore[reportArgumentType]
     monkeypatch.setattr(_draws, "_sources", lambda *_: (_ for _ in ()).throw(KeyError("fitted")))
     for count, seed in ((2, 0), (10_000, 2**31 - 2)):
         with pytest.raises(KeyError, match="fitted"):
