@@ -112,22 +112,25 @@ def _why(found: tuning.Tuned, folder: Path) -> str:
 
     failed = found.verification.failed
     binds = [item.note for item in failed if item.requirement.metric == found.binding]
-    blind = verification.ALONE in binds or (found.binding is None and any(item.value is None for item in failed))
+    unknown = [item.note for item in failed if item.value is None]
+    blind = verification.ALONE in binds or any("no linear form" in note for note in unknown)
     unheard = any(note.startswith("not supported by the data") for note in binds)
-    way = way_on(found.binding, unheard=unheard, blind=blind)
+    way = way_on(found.binding, unheard=unheard, blind=blind, unknown=bool(unknown))
     return f"{folder}: the best so far does not keep all requirements. {failing_requirement(found)} {way}."
 
 
-def way_on(binding: str | None, *, unheard: bool, blind: bool = False) -> str:
+def way_on(binding: str | None, *, unheard: bool, blind: bool = False, unknown: bool = False) -> str:
     """Return the advice on the active requirement.
 
     `binding`: the active requirement; None if it is not known. `unheard`: whether the data do not support it. `blind`:
-    whether the kind has no linear form to test against the data.
+    whether the kind has no linear form to test against the data. `unknown`: whether something else was not computed.
     """
     from softneck.verification import MARGIN_GROUPS
 
     if blind:
         return "No setting fixes it: name kinds with a linear form in --kinds, such as pi or lqg"
+    if unknown:
+        return "No setting of a controller fixes it: give what is missing, or leave the requirement out"
     if binding is None:
         return "Continue with a larger --budget"
     if unheard:

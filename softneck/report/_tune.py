@@ -221,7 +221,7 @@ def _verdicts(found: Tuned) -> list[tuple[Requirement, float | None, bool | None
     for verdict in found.verification.verdicts:
         item, value, holds = verdict.requirement, verdict.value, verdict.holds
         tuned = found.best.metrics.get(item.metric)
-        if value is not None and tuned is not None and item.metric.startswith("sim.") and tuned > value:
+        if value is not None and tuned is not None and item.metric.startswith("sim.") and not tuned <= value:
             # Loops of tuning alone: with noise, or with another dead time.
             value, holds = tuned, bool(holds) and item.holds(tuned)
         rows.append((item, value, holds, verdict.note))
@@ -262,10 +262,14 @@ def failing_requirement(found: Tuned) -> str:
     """Return a sentence or two on the requirement that fails."""
     if found.holds:
         return ""
-    unknown = [item for item in found.verification.failed if item.value is None]
-    if found.binding is None and unknown:
-        metrics = ", ".join(verdict.requirement.metric for verdict in unknown)
-        return f"{metrics} of {found.best.kind}: {unknown[0].note}."
+    unknown: dict[str, list[str]] = {}
+    for item in found.verification.failed:
+        if item.value is None:
+            unknown.setdefault(item.note, []).append(item.requirement.metric)
+    if unknown:  # whatever else fails, no limit makes these hold
+        also = f" {found.binding} fails." if found.binding else ""
+        said = "; ".join(f"{', '.join(metrics)} of {found.best.kind}: {note}" for note, metrics in unknown.items())
+        return f"{said}.{also}"
     if found.binding is None:
         # Unlike `verify`, tuning has loops with noise, smaller steps and a circle.
         limits = dict.fromkeys(bound.metric for bound in found.task.asked.bounds)
@@ -276,7 +280,7 @@ def failing_requirement(found: Tuned) -> str:
     sign, limit = next((b.bound, b.limit) for b in found.task.asked.bounds if b.metric == found.binding)
     value = f"{found.nearest:.3g}, required {_SIGNS[sign]} {limit:.3g}"
     task, judged = found.task, found.verification.failed
-    failed = {verdict.requirement.metric for verdict in judged if verdict.value is not None}
+    failed = {verdict.requirement.metric for verdict in judged}
     failed |= {name for name, ratio in found.best.ratios(task.bounds, tested=task.tested).items() if ratio > 1.0}
     if failed <= {found.binding}:
         return f"Only {found.binding} fails: {value}."

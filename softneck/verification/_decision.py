@@ -80,9 +80,11 @@ def certificate_decision(one: Values, *, tuner: str | None = None) -> str:
         return f"Do not run {name} yet: no requirement was judged."
     failing = "; ".join(_requirement(row) for row in one["failed"][:2])
     more = f" and {len(one['failed']) - 2} more" if len(one["failed"]) > 2 else ""
-    # A safety margin is never loosened.
+    # A safety margin is never loosened, and what was not computed holds at no limit.
     margins = any(str(row["metric"]).startswith(MARGIN_GROUPS) for row in one["failed"])
+    blind = any("no linear form" in str(row["note"]) for row in one["failed"])
     way = "allow a slower rise" if margins else "loosen these"
+    way = "take a kind with a linear form, such as pi or lqg" if blind else way
     return (
         f"Do not run {name} yet: {len(one['failed'])} of {count} requirements fail: {failing}{more}. "
         f"Next: {way}, or record another motion and start with both logs{'; ' + trade if trade else ''}."

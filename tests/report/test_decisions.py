@@ -201,6 +201,12 @@ def test_a_project_decides_on_model_controller_and_next_step() -> None:
             "0.4; gain margin, worst axis not computed, required at least 2.5 (no plant) and 1 more. Next: allow a "
             "slower rise, or record another motion and start with both logs."
         )
+    # A slower rise computes no margin.
+    rows = [{**row, "note": "not computed: the controller adaptive has no linear form"} if row["value"] is None else row
+            for row in certificate(3)["requirements"]]  # fmt: skip
+    blind = certificate_values("z.json", {**certificate(3), "requirements": rows})
+    said = project_decision([], [blind], tuner=None)
+    assert "Next: take a kind with a linear form, such as pi or lqg, or record" in said
     # One that is no margin may be loosened.
     rise = certificate_values("z.json", {**certificate(3), "requirements": certificate(3)["requirements"][:1]})
     assert "Next: loosen these, or record" in project_decision([], [rise], tuner=None)

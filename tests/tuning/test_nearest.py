@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,12 +13,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from softneck.cli._tune import _why
 from softneck.loop.default_limits import NECK_RISE_S
-from softneck.report._tune import failing_requirement, tune_verdict
+from softneck.report._tune import _verdict_rows, failing_requirement, requirement_rows, tune_verdict
 from softneck.tuning import _tune
 from softneck.tuning._requirements import TuneRequirements, make_tune_requirements, relax_limits
 from softneck.tuning._search import Candidate
 from softneck.tuning._tune import Loosened, relaxations
+from softneck.verification._decision import verdict_values
 from softneck.verification._requirements import Requirement
 from softneck.verification._verify import Verdict
 
@@ -111,6 +114,64 @@ def test_what_fails_is_said_of_the_controller_that_is_written(values: dict[str, 
         task=SimpleNamespace(bounds=bounds, tested=False, asked=SimpleNamespace(bounds=bounds)),
     )  # fmt: skip
     assert failing_requirement(found) == said
+
+
+@pytest.mark.parametrize("binding", [None, "step.rise_s"])
+@pytest.mark.parametrize("nearest", [None, 0.52])
+def test_what_was_not_computed_is_said_first_and_no_limit_is_said_to_make_it_hold(
+    binding: str | None, nearest: float | None
+) -> None:
+    """`adaptive` was picked with all its margins "-", and `tune` ended "at 0.52 all the rest would hold"."""
+    why, off = "not computed: no linear form", "not computed: switched off"
+    unknown = [replace(failed(name, None), note=note) for name, note in
+               (("axes.gain_margin", why), ("stability.searched_radius", off), ("robust.mu", why))]  # fmt: skip
+    bounds = [bound("step.load_rms_deg"), *(item.requirement for item in unknown)]
+    best = Candidate("adaptive", {}, np.zeros(0), "all", {"step.load_rms_deg": 0.5, "step.rise_s": 0.52})
+    found: Any = SimpleNamespace(
+        holds=False, best=best, binding=binding, nearest=nearest, evaluations=6,
+        verification=SimpleNamespace(failed=[failed("step.load_rms_deg", 3.0), *unknown]),
+        task=SimpleNamespace(bounds=bounds, tested=False, asked=SimpleNamespace(bounds=bounds)),
+    )  # fmt: skip
+    said = failing_requirement(found)
+    assert said == (
+        f"axes.gain_margin, robust.mu of adaptive: {why}; stability.searched_radius of adaptive: {off}."
+        + (" step.rise_s fails." if binding else "")
+    )
+    assert "0.52" not in said
+    advice = _why(found, Path("out"))
+    assert said in advice
+    assert "oosen" not in advice
+    assert advice.endswith("name kinds with a linear form in --kinds, such as pi or lqg.")
+    found.verification.failed = unknown[1:2]
+    assert "give what is missing, or leave the requirement out" in _why(found, Path("out"))
+
+
+def test_a_result_holds_nothing_that_its_certificate_has_not() -> None:
+    """In rows of the table, of the JSON and of the decision no None, NaN and infinite value counts as holding."""
+    values = (None, math.nan, math.inf, 0.5)
+    rows = [Verdict(bound("step.load_rms_deg"), value, value == 0.5, {}, "") for value in values]
+    best = Candidate("pi", {}, np.zeros(0), "all", {"step.load_rms_deg": 0.5})
+    asked = SimpleNamespace(bounds=[bound("track.circle_rms_deg")])
+    found: Any = SimpleNamespace(
+        verification=SimpleNamespace(verdicts=rows), best=best, task=SimpleNamespace(asked=asked, own={"p": 1})
+    )
+    assert [row[4] for row in requirement_rows(found)] == ["not computed", "fails", "fails", "holds", "not computed"]
+    told = verdict_values(_verdict_rows(found))
+    assert (told["requirements"], len(told["failed"])) == (5, 4)
+    assert [row["value"] for row in told["failed"]] == [None] * 4
+    # A circle that was not simulated fails where there is a model, and decides nothing where there is none.
+    for circle, own, held in ((None, {"p": 1}, False), (None, {}, None), (math.nan, {"p": 1}, False),
+                              (math.inf, {"p": 1}, False), (2.0, {"p": 1}, True), (2.0, {}, True)):  # fmt: skip
+        best.metrics |= {} if circle is None else {"track.circle_rms_deg": circle}
+        found.task.own = own
+        assert _verdict_rows(found)[-1]["holds"] is held
+    # Loops of tuning alone that are worse than those of `verify` count; of no number nothing is better.
+    for metric, value, tuned, held in (("sim.rise_s", 0.4, 0.9, False), ("sim.rise_s", 0.4, math.inf, False),
+                                       ("sim.rise_s", 0.4, math.nan, False), ("sim.rise_s", 0.4, 0.3, True),
+                                       ("sim.rise_s", None, 0.3, None)):  # fmt: skip
+        found.verification.verdicts = [Verdict(bound(metric), value, None if value is None else True, {}, "")]
+        best.metrics[metric] = tuned
+        assert _verdict_rows(found)[0]["holds"] is held, (value, tuned)
 
 
 def test_what_was_not_computed_is_not_said_to_hold() -> None:
