@@ -43,6 +43,7 @@ class Step:
         finding: a requirement that cannot hold whatever the result; empty if there is none.
         settings: repeats the step when it changes; the command if empty.
         resumes: file of an interrupted run, from which it continues without `--force`.
+        beside: later steps that read nothing of it or of those between: they begin with it, on another core.
     """
 
     stage: str
@@ -53,6 +54,7 @@ class Step:
     finding: str = ""
     settings: str = ""
     resumes: str = ""
+    beside: tuple[Step, ...] = ()
 
     @property
     def key(self) -> str:
@@ -208,7 +210,12 @@ def _models(recordings: list[str], options: Options) -> Iterator[Step]:
     robot = Robot.read("robot.toml")
     if absent := lacking(robot):
         note(f"robot.toml lacks {', '.join(absent)}: add them now, or the run ends after the models")
-    yield Step(stage="identification", command=command, makes=(AUTO,), reads=tuple(recordings), unmet=Unmet.NO_MODEL)
+    # Linear checks then cover the uncertainty of the recordings, not one nominal model.
+    words = ("softneck", "family", *recordings, "-o", FAMILY, "--html", "build/family.html", "--force")
+    family = Step(stage="identification", command=words, makes=(FAMILY,), reads=tuple(recordings),
+                  unmet=Unmet.DONE_WITHOUT)  # fmt: skip
+    yield Step(stage="identification", command=command, makes=(AUTO,), reads=tuple(recordings), unmet=Unmet.NO_MODEL,
+               beside=(family,))  # fmt: skip
     require_known(Robot.read("robot.toml"))
     linear = linear_model()
     command = ("softneck", "design", "pi", linear, "-o", PI, "--force")
@@ -216,10 +223,7 @@ def _models(recordings: list[str], options: Options) -> Iterator[Step]:
     data = [word for recording in recordings for word in ("--data", recording)]
     command = ("softneck", "observer", linear, *data, "-o", OBSERVER, "--force")
     yield Step(stage="observer", command=command, makes=(OBSERVER,), reads=(linear, *recordings))
-    # Linear checks then cover the uncertainty of the recordings, not one nominal model.
-    command = ("softneck", "family", *recordings, "-o", FAMILY, "--html", "build/family.html", "--force")
-    yield Step(stage="identification", command=command, makes=(FAMILY,), reads=tuple(recordings),
-               unmet=Unmet.DONE_WITHOUT)  # fmt: skip
+    yield family
 
 
 def linear_model() -> str:
@@ -250,21 +254,28 @@ def _controller(options: Options) -> Iterator[Step]:
     # --force continues the same search, and replaces another one. In this process: with empty caches each further
     # process compiles the same again, which takes most of the time of 80 evaluations.
     command = ("softneck", "tune", *plants, *words, "--observer", OBSERVER, "--workers", "0", "-o", "tune", "--force")
+    fmus = _fmus(plants[-1], options)
     yield Step(stage="tune", command=command, makes=(BEST, _TUNED_LOOP, "tune/report.html", TUNER),
-               reads=(*plants, OBSERVER, *wanted), finding=finding)  # fmt: skip
+               reads=(*plants, OBSERVER, *wanted), finding=finding, beside=tuple(fmus[:2]))  # fmt: skip
     eyes = (OBSERVER,) if uses_observer() else ()
     command = ("softneck", "verify", BEST, *plants, "--requirements", _REQUIREMENTS,
                *(word for file in eyes for word in ("--observer", file)),
                "-o", CERTIFICATE, "--html", "build/verify.html", "--force")  # fmt: skip
     yield Step(stage="verify", command=command, makes=(CERTIFICATE, "build/verify.html"),
                reads=(BEST, *plants, _REQUIREMENTS, *eyes))  # fmt: skip
+    yield from fmus
+
+
+def _fmus(plant: str, options: Options) -> list[Step]:
+    """Return the steps of the three FMUs: plant, observer, controller."""
     made = options.backend
     if made == "compiled":
         robot = Robot.read("robot.toml")
         made = backend(packaged=(len(robot.motors.names), len(robot.outputs.names)) == (3, 2))
-    for file, fmu in ((plants[-1], PLANT_FMU), (OBSERVER, OBSERVER_FMU), (BEST, CONTROLLER_FMU)):
-        command = ("softneck", "fmu", file, "--backend", made, "-o", fmu, "--force")
-        yield Step(stage="FMUs", command=command, makes=(fmu,), reads=(file,))
+    return [
+        Step(stage="FMUs", command=("softneck", "fmu", file, "--backend", made, "-o", fmu, "--force"), makes=(fmu,),
+             reads=(file,)) for file, fmu in ((plant, PLANT_FMU), (OBSERVER, OBSERVER_FMU), (BEST, CONTROLLER_FMU))
+    ]  # fmt: skip
 
 
 def uses_observer() -> bool:

@@ -9,11 +9,12 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import click
 
@@ -44,13 +45,14 @@ class ProjectRun:
 
     `done`: key of a step -> its command, inputs (file -> SHA-256), whether it ended and held, its seconds. `answers`:
     the options beside the logs. `as_json`: print nothing but JSON. `ran`: keys of the steps of this call, in their
-    order, each with whether it was done before.
+    order, each with whether it was done before. `begun`: key of a step -> its process, beside that of an earlier step.
     """
 
     done: dict[str, dict[str, Any]] = field(default_factory=dict)
     answers: dict[str, Any] = field(default_factory=dict)
     as_json: bool = False
     ran: dict[str, bool] = field(default_factory=dict)
+    begun: dict[str, _Process] = field(default_factory=dict)
 
     @classmethod
     def read(cls, *, as_json: bool) -> ProjectRun:
@@ -78,12 +80,14 @@ class ProjectRun:
     def do(self, step: Step) -> None:
         """Run a step unless it is finished; its result is in `done`."""
         entry = self.done.get(step.key, {})
-        reads = {name: _hash(name) for name in step.reads}
+        reads = _hashes(step)
         same = entry.get("asked") == step.depends_on and entry.get("reads") == reads
-        kept = same and bool(entry.get("ended")) and all(Path(name).is_file() for name in step.makes)
+        kept = self._is_done(step)
         self.ran[step.key] = kept
         self._tell(step, kept)
         if not kept:
+            for other in step.beside:
+                self._begin(other)
             begun = bool(same and entry and not entry.get("ended"))
             self.done[step.key] = {
                 "command": step.shown,
@@ -103,6 +107,32 @@ class ProjectRun:
         elif said["said"]:
             note(f"continues without {step.makes[0]}: {said['said']}")
 
+    def close(self) -> None:
+        """End the steps that began and had no turn."""
+        while self.begun:
+            self.begun.popitem()[1].end()
+
+    def _is_done(self, step: Step) -> bool:
+        entry = self.done.get(step.key, {})
+        same = entry.get("asked") == step.depends_on and entry.get("reads") == _hashes(step)
+        return same and bool(entry.get("ended")) and all(Path(name).is_file() for name in step.makes)
+
+    def _begin(self, step: Step) -> None:
+        """Begin a step in a process of its own, if it is to be done and there is a core for it."""
+        if step.key not in self.begun and not self._is_done(step) and _core_count() > 1:
+            self.begun[step.key] = _Process.of(step, as_json=self.as_json)
+
+    def _was_begun(self, step: Step) -> bool:
+        """Wait for a step that has begun and tell what it said; return whether it needs no other run.
+
+        One that did not end well is run again, and tells of its error in the usual way.
+        """
+        if step.key not in self.begun:
+            return False
+        well = self.begun[step.key].finish(step, as_json=self.as_json)
+        self.begun.pop(step.key).close()  # until then Ctrl-C ends it
+        return well
+
     def _tell(self, step: Step, kept: bool) -> None:
         line = f"[{STAGES.index(step.stage) + 1}/{len(STAGES)}] {step.stage}{' (done before)' if kept else ''}"
         click.echo(f"\n{line}\n$ {step.shown}", err=self.as_json)
@@ -112,7 +142,8 @@ class ProjectRun:
         entry |= {"holds": not step.finding, "said": step.finding}
         try:
             with _ctrl_c_ends(), contextlib.redirect_stdout(io.StringIO() if self.as_json else sys.stdout):
-                (_pytest if words[0] == "python" else _softneck)(words, as_json=self.as_json)
+                if not self._was_begun(step):
+                    (_pytest if words[0] == "python" else _softneck)(words, as_json=self.as_json)
         except CheckFailedError as error:
             ended = False
             entry |= {"holds": False, "said": " ".join(filter(None, [step.finding, str(error)]))}
@@ -127,9 +158,53 @@ class ProjectRun:
         if lacking and ended:
             raise OutputFileError(f"{lacking[0]}: was not made by `{step.shown}`.")
         # Inputs are hashed again: a layout that an import proposed is one of them from now on.
-        entry |= {"reads": {name: _hash(name) for name in step.reads}, "ended": True,
+        entry |= {"reads": _hashes(step), "ended": True,
                   "seconds": round(_processor_time() - begin, 2)}  # fmt: skip
         self.write()
+
+
+@dataclass(frozen=True, slots=True)
+class _Process:
+    """A step in a process of its own: its files, the hashes of what it reads, and files with what it says."""
+
+    running: subprocess.Popen[bytes]
+    makes: tuple[str, ...]
+    reads: dict[str, str]
+    said: tuple[IO[bytes], IO[bytes]]
+
+    @classmethod
+    def of(cls, step: Step, *, as_json: bool) -> _Process:
+        said = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115 - until the step has its turn
+        words = [sys.executable, "-P", "-m", *step.command, *(["--json"] if as_json else [])]
+        running = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=said[0], stderr=said[1])
+        return cls(running, step.makes, _hashes(step), said)
+
+    def finish(self, step: Step, *, as_json: bool) -> bool:
+        """Wait until it ends, and print what it said; return whether it ended well on the files of now."""
+        if self.running.wait() != 0 or self.reads != _hashes(step):
+            return False
+        for stream, err in zip(self.said, (False, True), strict=True):
+            stream.seek(0)
+            if err or not as_json:
+                click.echo(stream.read(), nl=False, err=err)
+        return True
+
+    def end(self) -> None:
+        """End it, and remove its files."""
+        self.running.kill()
+        self.running.wait()
+        for name in self.makes:
+            Path(name).unlink(missing_ok=True)
+        self.close()
+
+    def close(self) -> None:
+        """Close the files with what it said."""
+        for stream in self.said:
+            stream.close()
+
+
+def _core_count() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _processor_time() -> float:
@@ -137,8 +212,8 @@ def _processor_time() -> float:
     return sum(os.times()[:4])
 
 
-def _hash(name: str) -> str:
-    return file_hash(name) if Path(name).is_file() else ""
+def _hashes(step: Step) -> dict[str, str]:
+    return {name: file_hash(name) if Path(name).is_file() else "" for name in step.reads}
 
 
 def _words(step: Step, *, begun: bool) -> tuple[str, ...]:

@@ -102,9 +102,10 @@ def command(
         if not as_json:
             click.echo(f"$ cd {folder}")
         try:
-            for step in steps(options):
-                _before(step, run, guided=guided)
-                run.do(step)
+            with contextlib.closing(run):
+                for step in steps(options):
+                    _before(step, run, guided=guided)
+                    run.do(step)
         except SoftneckError as error:
             raise _with_advice(error, run, folder, paths) from error
         facts = {**_facts(run, folder), "not_run": not_run}

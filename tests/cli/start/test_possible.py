@@ -164,6 +164,7 @@ def test_a_family_that_cannot_be_made_is_done_without_and_none_of_other_recordin
     assert planned[0][2:5] == ("models/auto.npz", "--kinds", "pi,pid,fopi,hinf,lqg,mpc")
     Path("models").mkdir()
     Path(_plan.FAMILY).touch()
+    assert call("robot", "new", "robot.toml", "--preset", "neck").code == 0
     beside = next(_plan._controller(Options(logs=()))).command
     assert beside[2:6] == (_plan.FAMILY, "models/auto.npz", "--kinds", "pi,pid,fopi,hinf,lqg")
 

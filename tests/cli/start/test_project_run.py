@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,13 +18,14 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from softneck.cli.start import _project_run, _start
-from softneck.core import CheckFailedError
+from softneck.cli.start import _plan, _project_run, _start
+from softneck.core import CheckFailedError, SettingsError
 from softneck.robot import Robot
 
 from ...data import neck_recording
 from ..conftest import Call
 
+popen = subprocess.Popen
 STEPS = ["robot: robot.toml", "quality: copy.toml", "loop: project/loop.toml"]
 
 
@@ -82,6 +84,83 @@ def test_other_settings_do_a_step_again_and_are_kept_for_the_next_time(call: Cal
     assert states(call, "--robot", "arm") == [False] * 3
     assert states(call) == [True] * 3, "what was asked for stands in the folder"
     assert states(call, "--robot", "finger") == [False, False, False]
+
+
+def beside(plan: Callable[[Any], Iterator[Any]], *words: str) -> Callable[[Any], Iterator[Any]]:
+    """Return a plan in which step 2 is a command that begins with step 1."""
+
+    def changed(asked: Any) -> Iterator[Any]:
+        first, second, third = plan(asked)
+        second = replace(second, command=("softneck", *words), reads=asked.logs)
+        yield from (replace(first, beside=(second,)), second, third)
+
+    return changed
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+def test_a_step_that_begins_with_another_makes_and_says_the_same_in_its_turn(
+    call: Call, short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int
+) -> None:
+    begun: list[Any] = []
+    monkeypatch.setattr(_project_run, "_core_count", lambda: cores)
+    monkeypatch.setattr(_project_run.subprocess, "Popen", lambda *a, **k: begun.append(popen(*a, **k)) or begun[-1])
+    monkeypatch.setattr(_start, "steps", beside(_start.steps, "robot", "new", "copy.toml", "--preset", "arm"))
+    said = call("start", "log.csv", "-o", "p", "--yes")
+    assert (said.code, len(begun)) == (0, cores - 1), said.err
+    lines = said.out.splitlines()
+    # A command says what it made after the line that tells of it.
+    at = lines.index("$ softneck robot new copy.toml --preset arm")
+    assert [line.split(":")[0] for line in lines if line.startswith(("robot.toml:", "copy.toml:"))] == [
+        "robot.toml", "copy.toml"]  # fmt: skip
+    assert any(line.startswith("copy.toml:") for line in lines[at:])
+    assert Robot.read("p/copy.toml").name == "arm"
+    assert states(call) == [True] * 3
+    assert len(begun) == cores - 1, "what is done does not begin again"
+
+
+def test_steps_that_begin_early_read_nothing_that_the_steps_before_their_turn_make(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_plan, "possible", lambda _: "")
+    assert call("robot", "new", "robot.toml", "--preset", "neck").code == 0
+    Path("tune").mkdir()
+    Path("tune/loop.toml").write_text("duration_s = 7.0\n", encoding="utf-8")
+    asked = _plan.Options(logs=())
+    early = 0
+    for planned in (list(_plan._models(["recordings/log.csv"], asked)), list(_plan._controller(asked))):
+        for number, step in enumerate(planned):
+            for other in step.beside:
+                between = planned[number : planned.index(other)]
+                assert not set(other.reads) & {name for one in between for name in one.makes}
+                early += 1
+    assert early == 3, "the family beside the models, the FMUs of plant and observer beside the search"
+
+
+def test_a_step_that_failed_beside_another_tells_of_it_in_its_turn(
+    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_project_run, "_core_count", lambda: 2)
+    monkeypatch.setattr(_start, "steps", beside(_start.steps, "robot", "new", "copy.toml", "--preset", "nobody"))
+    said = call("start", "log.csv", "-o", "p", "--yes")
+    assert said.code == 2
+    assert "nobody" in said.err.splitlines()[-1]
+    assert said.err.count("got 'nobody'") == 1, "what the other process said of it is not told twice"
+
+
+def test_a_step_that_has_no_turn_leaves_no_file(call: Call, short: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[Any] = []
+    monkeypatch.setattr(_project_run, "_core_count", lambda: 2)
+    monkeypatch.setattr(_project_run.subprocess, "Popen", lambda *a, **k: begun.append(popen(*a, **k)) or begun[-1])
+
+    def fails(words: tuple[str, ...], *, as_json: bool) -> None:
+        assert begun[0].wait() == 0
+        assert Path("copy.toml").is_file()
+        raise SettingsError(f"{words[1]} cannot.")
+
+    monkeypatch.setattr(_project_run, "_softneck", fails)
+    monkeypatch.setattr(_start, "steps", beside(_start.steps, "robot", "new", "copy.toml", "--preset", "arm"))
+    assert call("start", "log.csv", "-o", "p", "--yes").code == 2
+    assert not Path("p").exists()
 
 
 @pytest.fixture
