@@ -71,6 +71,12 @@ METRICS = {
     "r2": Metric("coefficient of determination", "ratio", larger=True),
     "rmse": Metric("error, rms", "mean"),
     "worst": Metric("largest error", "peak"),
+    "cold_fits": Metric("fit from the first row alone", "ratio", larger=True),
+    "coverage": Metric("samples within the bounds", "mean", larger=True),
+    "mean_width": Metric("mean width of the bounds", "mean"),
+    "outside": Metric("samples outside what the model has seen", "mean"),
+    "log_likelihood": Metric("log likelihood of a measurement", "mean", larger=True),
+    "checks": Metric("look-ahead error, rms", "mean"),
 }
 
 

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 
+import numpy as np
 import pytest
 
 from softneck import loop
 from softneck.core import METRICS, SettingsError, metric_of, worst
+from softneck.design.plants._uncertain import StepAndLoadResult
+from softneck.estimation._noise import Consistency, NoiseFit
+from softneck.estimation._observer import FittedObserver
+from softneck.identification import Draws
 from softneck.identification.validation._validation import Validation
 from softneck.robot import Robot
 from softneck.verification import LARGE, SMALL, Scale, metric_names
+from softneck.verification._linear import AxisMargins
+from softneck.verification._structured import SearchResult
 
 from ..order import MEMBERS, check_worst
 
@@ -19,12 +27,33 @@ PRESSURE = Robot.from_dict({"name": "bellows", "motors": {"names": ["a", "b"], "
                             "outputs": {"names": ["tip"], "unit": "m", "display_unit": "mm"},
                             "directions": {"kind": "identified"}})  # fmt: skip
 SCORES = ("fits", "rmse_deg", "r2", "worst_deg")
+# Better when larger, without an end at zero.
+RATIOS = ("fits", "r2", "cold_fits", "coverage", "coverage_pct", "log_likelihood")
+# The numbers of a result that nobody aggregates: settings, instants, series, and what has no better direction.
+NO_METRICS: dict[type, set[str]] = {
+    Validation: {"persistence", "best_linear", "worst_time", "intervals", "per_run", "diverged", "calibrated_bounds",
+                 "validity", "time", "run", "measured", "free_run", "one_step", "lower", "upper"},
+    Consistency: {"level", "inside", "mean", "mean_band"}, NoiseFit: {"noise", "start"}, FittedObserver: set(),
+    Draws: {"arrays", "factor", "share", "keep", "noise", "level", "conditions"},
+    AxisMargins: {"band", "crossover", "margins", "at"}, SearchResult: set(),
+    StepAndLoadResult: {"angles", "inputs"},
+}  # fmt: skip
+
+
+def numbers_of(result: type) -> set[str]:
+    """Return the fields of a result that hold floats, alone or in arrays and tables, but those of `NO_METRICS`."""
+    kinds = re.compile(r"\b(float|Vector|Matrix|ndarray|Scores|Any)\b")
+    named = {field.name for field in dataclasses.fields(result) if kinds.search(str(field.type))}
+    assert NO_METRICS[result] <= named, "a field that went is named here"
+    return named - NO_METRICS[result]
+
+
 # What `softneck` states, for the neck and for a robot in other units.
 STATED = sorted(
     {
         *(name for robot in (Robot.preset(), PRESSURE) for name in metric_names(robot, track=True)),
         *(name for robot in (Robot.preset(), PRESSURE) for name in loop.metric_names(robot)),
-        "validity.min", *SCORES,
+        "validity.min", *SCORES, *(name for result in NO_METRICS for name in numbers_of(result)),
     }
 )  # fmt: skip
 
@@ -51,10 +80,33 @@ def test_margins_and_fits_are_better_when_larger_and_all_else_when_smaller() -> 
     assert all(metric_of(name).larger for name in (*LARGE, "validity.min", "fits", "r2"))
     assert not any(metric_of(name).larger for name in SMALL)
     assert {key for key, item in METRICS.items() if item.larger} == {
-        "disk_margin", "gain_margin", "phase_margin", "delay_margin", "min", "fits", "r2",
+        "disk_margin", "gain_margin", "phase_margin", "delay_margin", "min", "fits", "r2", "cold_fits", "coverage",
+        "log_likelihood",
     }  # fmt: skip
-    tables = {field.name for field in dataclasses.fields(Validation)}
-    assert set(SCORES) <= tables
+    assert set(SCORES) <= numbers_of(Validation)
+
+
+def test_a_number_of_a_result_that_is_neither_registered_nor_named_is_found() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Charming(Consistency):
+        charm: dict[str, float] | None = None
+        words: tuple[str, ...] = ()
+
+    NO_METRICS[Charming] = NO_METRICS[Consistency]
+    try:
+        assert numbers_of(Charming) == {"charm"}
+    finally:
+        del NO_METRICS[Charming]
+
+
+@pytest.mark.parametrize("robot", [Robot.preset(), PRESSURE], ids=["neck", "pressure"])
+def test_a_loop_states_the_metrics_that_are_registered_for_its_robot_and_no_others(robot: Robot) -> None:
+    t = 0.02 * np.arange(100)
+    names = [*robot.set_points, *(f"{name}{end}" for name in robot.outputs.names for end in ("", "_reference"))]
+    result = loop.LoopResult(t, dict.fromkeys(names, np.sin(t)) | {"validity": 1.0 + 0.0 * t}, {}, 0.02, robot=robot)
+    found = loop.metrics(result)
+    stated = {f"{group}.{name}" for group, values in found.items() for name in values}
+    assert stated == {*loop.metric_names(robot), "validity.min"}
 
 
 def test_the_longest_name_counts_and_units_do_not() -> None:
@@ -69,4 +121,6 @@ def test_an_unknown_margin_is_none_and_an_unknown_error_infinite() -> None:
     for name in STATED:
         unknown = metric_of(name).unknown
         assert worst(name, [*MEMBERS, math.nan]) == worst(name, [math.nan, *MEMBERS]) == unknown
-        assert unknown == (math.inf if not metric_of(name).larger else -math.inf if name in SCORES else 0.0)
+        assert unknown == (
+            math.inf if not metric_of(name).larger else 0.0 if metric_of(name).of == "peak" else -math.inf
+        )
