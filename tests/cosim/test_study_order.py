@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from concurrent.futures import BrokenExecutor, CancelledError, Future
 from itertools import permutations
@@ -343,14 +344,49 @@ def test_parts_of_one_class_with_other_numbers_are_other_studies(monkeypatch: py
         assert (one != other) is steps
 
 
-def test_a_loop_in_a_study_file_starts_at_its_folder_and_one_beside_it_too(tmp_path: Path) -> None:
-    loop = '"x.npz"'
-    text = 'runs = 2\n[loop]\nduration_s = 1.0\nplant = "paper"\ncontroller = {controller}\n[loop.reference]\n'
-    text += 'kind = "step"\npitch_deg = 5.0\nat_s = 0.2\n[vary]\n"reference.pitch_deg" = {{ uniform = [1.0, 2.0] }}\n'
-    (tmp_path / "study.toml").write_text(text.format(controller=loop))
-    made = _study.load_study(tmp_path / "study.toml")
-    assert made.folder == tmp_path
-    (tmp_path / "inner").mkdir()
-    (tmp_path / "inner" / "loop.toml").write_text("duration_s = 1.0\n")
-    told = {"loop": "inner/loop.toml", "runs": 2}
-    assert _study._from_table(tmp_path / "study.toml", told).folder == tmp_path / "inner"
+def test_a_loop_in_a_study_file_starts_at_its_folder_and_a_file_beside_it_is_a_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_study, "make_study", lambda loop, **told: (loop, told))
+    file, table = tmp_path / "steps.toml", {"duration_s": 1.0}
+    rest = {"vary": {"a": 1}, "runs": 2, "seed": 3}
+    told = {"name": "steps", **rest}
+    assert _study._from_table(file, {"loop": table, **rest}) == (table, {"folder": tmp_path, **told})
+    assert _study._from_table(file, {"loop": "in/loop.toml", **rest}) == (
+        tmp_path / "in" / "loop.toml", {"folder": None, **told},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [(Path("a"), Path("b")), ({"x": 1.0}, {"x": 2.0}), ([1, "a", None], [1, "a", True]), ((1, 2), (2, 1)),
+     ({"x": [Path("a")]}, {"x": [Path("b")]}), (1, "1")],
+)  # fmt: skip
+def test_what_a_study_varies_is_told_apart_in_its_description(one: Any, other: Any) -> None:
+    told = [json.dumps(_study._plain(value)) for value in (one, one, other)]
+    assert told[0] == told[1] != told[2]
+    assert _study._plain(Path("a/b")) == "a/b"
+    assert _study._plain({1: (2.5, None)}) == {"1": [2.5, None]}
+
+
+def test_a_cluster_is_asked_for_each_run_anew_and_has_two_chunks_for_each_of_its_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Dask keeps results of pure functions by their arguments; runs write what their loops measured, each time."""
+    pool, client = Mock(), Mock()
+    client.scheduler_info.return_value = {"workers": {"a": {"nthreads": 2}, "b": {"nthreads": 3}}}
+    client.get_executor.return_value = pool
+    monkeypatch.setattr(_run_study, "_client", lambda _: client)
+    with _run_study.open_workers(None, "tcp://there") as workers:
+        assert (workers.size, workers.pool, workers.start) == (5, pool, None)
+    client.get_executor.assert_called_once_with(pure=False)
+    client.scheduler_info.assert_called_once_with(n_workers=-1)  # all of them, not the first five
+    pool.shutdown.assert_called_once_with(wait=False)
+    client.close.assert_called_once()
+    with pytest.raises(SettingsError, match="not both"), _run_study.open_workers(2, "tcp://there"):
+        pass
+    for number in (-1, True, 2.5):
+        with pytest.raises(SettingsError, match="`workers` must be"), _run_study.open_workers(number, None):  # pyright: ignore[reportArgumentType]
+            pass
+    with _run_study.open_workers(0, None) as workers:
+        assert (workers.size, type(workers.pool)) == (1, _run_study.SameProcess)

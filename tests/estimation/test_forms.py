@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import control
 import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.estimation import KalmanSettings, LinearNeck, axis_plant
+from softneck.estimation import KalmanSettings, LinearNeck, _kalman_runtime, axis_plant
 from softneck.estimation._kalman_parts_runtime import KALMAN_FROZEN, KALMAN_GATE
 from softneck.signals import Recording
 
@@ -237,3 +239,51 @@ def test_the_gyros_ports_are_there_with_the_gyro_only() -> None:
     record = smooth_motion(rows=5)
     assert rows_of(KalmanSettings(form="gyro").design(neck()), record).shape[1] == len(names)
     assert len(KalmanSettings().design(neck()).block().inputs) == 6
+
+
+# -- the filter's algebra, in both of its forms ------------------------------------------------------------------------
+
+
+def positive(rng: np.random.Generator, n: int) -> np.ndarray:
+    A = rng.standard_normal((n, n))
+    return A @ A.T + 0.1 * np.eye(n)
+
+
+@pytest.mark.parametrize("outputs", [1, 2, 3, 5])
+def test_the_innovations_covariance_is_inverted_with_its_determinant(outputs: int) -> None:
+    rng = np.random.default_rng(outputs)
+    S, e, r = positive(rng, outputs), rng.standard_normal(outputs), 0.3
+    whole = S + r * np.eye(outputs)
+    expected = e @ np.linalg.solve(whole, e), np.linalg.slogdet(whole)[1]
+    for invert in (_kalman_runtime.kalman_more, *([_kalman_runtime.kalman_two] if outputs == 2 else [])):
+        # What rounding made unsymmetric counts by its symmetric part.
+        skew = 1e-3 * np.triu(rng.standard_normal((outputs, outputs)), 1)
+        inverse = S + skew - skew.T
+        np.testing.assert_allclose(invert(inverse, e, r), expected, rtol=1e-10)
+        np.testing.assert_allclose(inverse, np.linalg.inv(whole), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize(("n", "outputs"), [(2, 1), (4, 2), (6, 3)])
+def test_both_forms_of_the_algebra_are_the_textbooks(
+    n: int, outputs: int, compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """P = F P F' + Q and P = (I - K H) P (I - K H)' + r K K' (Anderson and Moore 1979), by loops and by BLAS."""
+    monkeypatch.setattr(_kalman_runtime, "COMPILED", compiled)
+    rng = np.random.default_rng(n)
+    P, K, H = positive(rng, n), rng.standard_normal((n, outputs)), rng.standard_normal((outputs, n))
+    # Half of F is zero, as of axes that are coupled by the gate alone.
+    F = rng.standard_normal((n, n)) * (np.arange(n)[:, None] % 2 == np.arange(n) % 2)
+    B = rng.standard_normal((n, outputs))
+    QM, QW = positive(rng, n), positive(rng, n)
+    np.testing.assert_allclose(_kalman_runtime.kalman_columns(F, H), F @ H.T, rtol=1e-12)
+    corrected, J = P.copy(), np.eye(n) - K @ H
+    _kalman_runtime.kalman_joseph(corrected, K, H, 0.3)
+    np.testing.assert_allclose(corrected, J @ P @ J.T + 0.3 * K @ K.T, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(corrected, corrected.T, rtol=1e-12)
+    arrays: Any = SimpleNamespace(F=F, B=B, first_noise=QM, second_noise=QW, n=n)
+    x, u, ahead = rng.standard_normal(n), rng.standard_normal(outputs), P.copy()
+    begin = x.copy()
+    _kalman_runtime.kalman_predict(arrays, np.array([9.0, 0.5, 0.2]), x, ahead, u)
+    np.testing.assert_allclose(x, F @ begin + B @ u, rtol=1e-12)
+    np.testing.assert_allclose(ahead, F @ P @ F.T + 0.25 * QM + 0.04 * QW, rtol=1e-10, atol=1e-12)

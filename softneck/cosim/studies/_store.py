@@ -156,7 +156,7 @@ def read_tables(files: Sequence[Path], vary: Mapping[str, Vary]) -> pd.DataFrame
     for path, part in zip(files, parts, strict=True):
         if not part.columns.equals(parts[0].columns):
             raise FileFormatError(f"{path}: has other columns than {files[0]}.")
-    table = pd.concat(parts, ignore_index=True).drop_duplicates("run")
+    table = pd.concat(parts).drop_duplicates("run")
     return table.sort_values("run", kind="stable", ignore_index=True)
 
 
