@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from concurrent.futures import BrokenExecutor, CancelledError, Future
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,9 +17,9 @@ import pandas as pd
 import pytest
 
 from softneck.core import DataError, FileFormatError, OutputFileError, SettingsError, metric_of
-from softneck.cosim import group_runs, pareto_front, rank, worst_runs
+from softneck.cosim import group_runs, make_study, pareto_front, rank, worst_runs
 from softneck.cosim.studies import _run_study, _study
-from softneck.cosim.studies._store import _spread, pareto_rows, read_tables
+from softneck.cosim.studies._store import Store, _spread, pareto_rows, read_tables
 from softneck.cosim.studies._study import Vary
 from softneck.loop import metric_names
 from softneck.robot import Robot
@@ -355,6 +356,30 @@ def test_a_loop_in_a_study_file_starts_at_its_folder_and_a_file_beside_it_is_a_p
     assert _study._from_table(file, {"loop": "in/loop.toml", **rest}) == (
         tmp_path / "in" / "loop.toml", {"folder": None, **told},
     )  # fmt: skip
+
+
+def test_a_study_is_continued_by_the_same_and_by_no_other_order_of_its_keys(tmp_path: Path) -> None:
+    """Runs are numbered along the first key, then the second: another order would mix two tables of runs."""
+    step = {"kind": "step", "pitch_deg": 5.0, "at_s": 0.2}
+    keys = {"reference.pitch_deg": {"grid": [1.0, 2.0]}, "reference.at_s": {"grid": [0.1, 0.2]}}
+    loop: dict[str, Any] = {"duration_s": 1.0, "plant": {"neck": "paper"}, "reference": step}
+    one, again = (make_study(loop, vary=keys) for _ in range(2))
+    turned = make_study(loop, vary=dict(reversed(keys.items())))
+    # The order of the loop's own keys is no other study.
+    same = make_study(dict(reversed(loop.items())), vary=keys)
+    assert one.digest == again.digest == same.digest
+    assert [p.labels for p in one.points] != [p.labels for p in turned.points]
+    Store(one, tmp_path)
+    for study in (one, again, same):
+        assert Store(study, tmp_path).done == set()
+    with pytest.raises(SettingsError, match=r"another study \(other order of vary\)"):
+        Store(turned, tmp_path)
+    with pytest.raises(SettingsError, match=r"another study \(other seed\)"):
+        Store(replace(one, seed=1), tmp_path)
+    assert Store(turned, tmp_path, force=True).done == set()
+    with pytest.raises(SettingsError, match="`objectives` is empty"):
+        replace(one, objectives=())
+    assert make_study(loop, vary=keys, objectives=()).objectives == one.objectives
 
 
 @pytest.mark.parametrize(
