@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,11 @@ def test_labels_of_choices() -> None:
     named = make_vary("c", {"grid": {"fast": 1, "slow": object()}})
     assert named.labels == ("fast", "slow")
     assert make_vary("c", {"choices": [{"file": "pi.npz"}, "x"]}).labels == ("pi.npz", "x")
+    # An object by its kind, else by its class; a table without a text by its values; equal ones by their number.
+    pi = SimpleNamespace(kind="pi")
+    assert make_vary("c", {"choices": [pi, set(), {"a": 1, "b": 2.5}]}).labels == ("pi", "set", "a = 1, b = 2.5")
+    assert make_vary("c", {"choices": [pi, SimpleNamespace(kind="pi"), True]}).labels == ("pi 1", "pi 2", "True")
+    assert make_vary("c", {"choices": [2, 0.5]}).labels == (2, 0.5)
 
 
 def test_nested_and_quoted_keys_are_the_same() -> None:

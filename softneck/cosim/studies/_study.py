@@ -293,10 +293,6 @@ class Study(ReprMixin):
         turns: list[dict[str, Any]] = [kinds]
         turns += [{**kinds, key: value} for key in kinds for value in self.vary[key].values]
         names: dict[str, set[str] | None] = {}
-        table = with_values(self.loop, kinds)
-        for key in self.vary:
-            if set_sources(key):
-                check_key(table, key, {})
         for turn in turns:
             table = with_values(self.loop, turn)
             setup = make_loop(table, self.folder)

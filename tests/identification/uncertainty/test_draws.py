@@ -127,6 +127,19 @@ def test_draws_that_do_not_fit_their_model_are_refused(made: Callable[..., Draws
         Draws.from_archive(header, arrays)
 
 
+@pytest.mark.parametrize(("rows", "count", "fits"), [(10, 3, False), (11, 3, True), (11, 4, False), (11, 0, False)])
+def test_a_file_has_the_draws_of_a_search_and_of_one_certificate(
+    made: Callable[..., Draws], rows: int, count: int, fits: bool
+) -> None:
+    header, arrays = made().to_archive()
+    arrays["drawn_weights"] = arrays["drawn_weights"][:rows]
+    if fits:
+        assert Draws.from_archive({**header, "count": count}, arrays).attempts == 1
+    else:
+        with pytest.raises(FileFormatError, match="fewer than one certificate needs"):
+            Draws.from_archive({**header, "count": count}, arrays)
+
+
 @pytest.mark.parametrize("number", [0, 3, -1])
 def test_every_draw_of_a_file_must_be_a_model(
     made: Callable[..., Draws], number: int, monkeypatch: pytest.MonkeyPatch
@@ -458,3 +471,26 @@ def test_the_making_of_draws_says_how_far_it_is_and_refuses_what_has_no_simulati
     monkeypatch.setattr(_draws._Motions, "simulate", lambda *_: np.full((4, 450, 2), np.nan))
     with pytest.raises(DataError, match="no draw has a finite simulation"):
         make_draws(recordings, count=2)
+
+
+@pytest.mark.parametrize(
+    ("scores", "chosen", "factor"),
+    [
+        # By the mean over all segments, and of its factors the smallest that is no worse by more than its error.
+        ([[0.1, 0.9], [0.1, 0.9], [0.4, 0.4], [0.4, 0.4]], 1, 1.0),
+        ([[0.5, 0.5], [0.3, 0.3], [0.4, 0.4], [0.4, 0.4]], 0, 2.0),
+        ([[0.5, 0.5], [0.5, 0.5], [0.3, 0.7], [0.49, 0.49]], 1, 1.0),
+        ([[np.inf, 0.1], [0.6, 0.6], [np.inf, np.inf], [0.7, 0.7]], 0, 2.0),
+    ],
+)
+def test_the_best_of_all_models_and_factors_is_the_one_of_the_least_mean_score(
+    scores: list[list[float]], chosen: int, factor: float, recordings: list[Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train, told = _draws._split(_draws.concatenate(recordings), 1.0)[0], iter(scores)
+    sources = [PlayDraws.fit(train, settings=each) for each in (QUICK, replace(QUICK, rate=5.0))]
+    monkeypatch.setattr(_draws, "_sources", lambda *_: sources)
+    monkeypatch.setattr(_draws, "_FACTORS", (1.0, 2.0))
+    monkeypatch.setattr(_draws, "_CALIBRATION_DRAWS", 4)
+    monkeypatch.setattr(_draws._Motions, "scores", lambda *_: np.array(next(told)))
+    found = make_draws(recordings, count=2)
+    assert (found.model, found.factor) == (sources[chosen].model, factor)
