@@ -294,12 +294,12 @@ class Study(ReprMixin):
         turns += [{**kinds, key: value} for key in kinds for value in self.vary[key].values]
         names: dict[str, set[str] | None] = {}
         for turn in turns:
-            table = with_values(self.loop, turn)
-            setup = make_loop(table, self.folder)
+            setup = make_loop(with_values(self.loop, turn), self.folder)
             for name, part in setup.loop.parts.items():
                 more = settable(part)
                 names[name] = None if more is None else (names.get(name) or set()) | more
-        loop = make_loop(with_values(self.loop, kinds), self.folder).loop
+        table = with_values(self.loop, kinds)
+        loop = make_loop(table, self.folder).loop
         for key in self.vary:
             check_key(table, key, names, loop.robot)
         LoopRun(loop)
