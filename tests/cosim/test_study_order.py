@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import tomllib
 from concurrent.futures import BrokenExecutor, CancelledError, Future
 from dataclasses import replace
 from itertools import permutations
@@ -17,9 +18,10 @@ import pandas as pd
 import pytest
 
 from softneck.core import DataError, FileFormatError, OutputFileError, SettingsError, metric_of
-from softneck.cosim import group_runs, make_study, pareto_front, rank, worst_runs
-from softneck.cosim.studies import _run_study, _study
-from softneck.cosim.studies._store import Store, _spread, pareto_rows, read_tables
+from softneck.cosim import group_runs, make_study, pareto_front, rank, read_runs, worst_runs
+from softneck.cosim.loops._loop_table import OBJECT
+from softneck.cosim.studies import _run_study, _store, _study
+from softneck.cosim.studies._store import Store, _spread, column_types, pareto_rows, read_tables, write_worst
 from softneck.cosim.studies._study import Vary
 from softneck.loop import metric_names
 from softneck.robot import Robot
@@ -415,3 +417,75 @@ def test_a_cluster_is_asked_for_each_run_anew_and_has_two_chunks_for_each_of_its
             pass
     with _run_study.open_workers(0, None) as workers:
         assert (workers.size, type(workers.pool)) == (1, _run_study.SameProcess)
+
+
+@pytest.mark.parametrize(
+    ("vary", "values", "kind"),
+    [(Vary("grid", (1, 2), (1, 2)), [1, 2], "int64"), (Vary("grid", (1, 0.5), (1, 0.5)), [1.0, 0.5], "float64"),
+     (Vary("grid", ("1", "x"), ("1", "x")), ["1", "x"], "str"),
+     (Vary("grid", (True, "x"), (True, "x")), ["True", "x"], "str"),
+     (Vary("choices", (True, False), (True, False)), ["True", "False"], "str"), (Vary("seed"), [7, 8], "int64"),
+     (Vary("uniform", (0.0, 1.0)), [0.1, 1.0 / 3.0], "float64")],
+)  # fmt: skip
+def test_what_was_varied_is_read_back_as_it_was_written(vary: Vary, values: Any, kind: str, tmp_path: Path) -> None:
+    table = runs_of((1.0, math.inf), holds=[True, None], errors=["", "it\u2028is, gone"]).assign(kind=values)
+    table.to_csv(tmp_path / "a.csv", index=False)
+    found = read_tables([tmp_path / "a.csv"], {"kind": vary})
+    assert column_types(["kind", "run", ERROR], {"kind": vary}) == {"kind": kind, "run": "int64", ERROR: "float64"}
+    assert found["kind"].tolist() == values
+    assert [type(value) for value in found["kind"].tolist()] == [type(value) for value in values]
+    assert found["error"].tolist() == table["error"].tolist()
+    assert found["holds"].tolist() == [True, pd.NA]
+    assert found[ERROR].tolist() == [1.0, math.inf]
+
+
+def test_a_cell_is_one_line_that_every_reader_of_tables_takes() -> None:
+    assert _store._cell(" a\n b\tc ") == "a b c"
+    assert _store._cell("a\0b") == "a?b"
+    assert _store._cell("\ud800") == "\\ud800"  # half a character
+    assert len(_store._cell("x" * 5000)) == 2000
+    assert (_store._cell(1.5), _store._cell(None), _store._cell("")) == (1.5, None, "")
+
+
+def test_files_that_were_not_finished_are_no_runs(tmp_path: Path) -> None:
+    parts = tmp_path / "runs.parts"
+    parts.mkdir()
+    for name in ("b.csv", "a.csv", ".c.csv", "d.txt"):
+        (parts / name).touch()
+    assert _store._files(tmp_path) == [parts / "a.csv", parts / "b.csv"]
+    (tmp_path / "runs.csv").touch()
+    assert _store._files(tmp_path) == [tmp_path / "runs.csv", parts / "a.csv", parts / "b.csv"]
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", "1", "{", '{"format": 1}', None])
+def test_a_folder_that_describes_no_study_is_refused(text: str | None, tmp_path: Path) -> None:
+    if text is not None:
+        (tmp_path / "study.json").write_text(text)
+    with pytest.raises(FileFormatError, match=r"study\.json"):
+        read_runs(tmp_path)
+    (tmp_path / "study.json").write_text('{"study": {"vary": {"a": {"kind": "grid", "labels": [1, 2]}, "b": 3}}}')
+    found = read_runs(tmp_path)
+    assert (list(found.columns), len(found), found["run"].dtype) == (["run"], 0, np.int64)
+
+
+@pytest.mark.parametrize("inner", [{}, {"folder": "parts"}])
+def test_the_worst_runs_are_loop_files_that_start_where_the_study_does(inner: dict[str, str], tmp_path: Path) -> None:
+    runs = runs_of((1.0, 3.0, 2.0, math.nan), errors=["", "", "", "it diverged"])
+    study: Any = SimpleNamespace(
+        objectives=[ERROR],
+        name="mine",
+        folder=tmp_path / "study",
+        table=lambda run: {"duration_s": float(run), **inner},
+    )
+    paths = write_worst(study, runs, tmp_path / "out" / "worst", count=2)
+    assert [path.name for path in paths] == ["run_00003.toml", "run_00001.toml"]
+    texts = [path.read_text() for path in paths]
+    assert texts[0].startswith("# Run 3 of study mine; it failed: it diverged\n")
+    assert texts[1].startswith("# Run 1 of study mine.\n")
+    start = (tmp_path / "out" / "worst" / tomllib.loads(texts[1])["folder"]).resolve()
+    assert start == tmp_path / "study" / inner.get("folder", "")
+    assert [tomllib.loads(text)["duration_s"] for text in texts] == [3.0, 1.0]
+    study.table = lambda _: {"plant": [{"x": {OBJECT: 1}}]}
+    with pytest.raises(SettingsError, match="parts that are not files"):
+        write_worst(study, runs, tmp_path)
+    assert not _store.has_objects({"plant": [{"x": {"file": OBJECT}}], "y": OBJECT})

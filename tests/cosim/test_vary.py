@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import SettingsError
+from softneck.cosim.studies import _study
 from softneck.cosim.studies._study import StudyPoints, flatten_keys, make_vary
 
 
@@ -119,3 +121,82 @@ def test_ranges_that_are_none(given: Any, message: str) -> None:
 def test_numbers_of_runs_that_cannot_be(vary: dict[str, Any], runs: Any, message: str) -> None:
     with pytest.raises(SettingsError, match=message):
         points(vary, runs)
+
+
+@pytest.mark.parametrize(
+    ("given", "ends"),
+    [({"uniform": [-1, 3]}, (-1.0, 3.0)), ({"log_uniform": [0.01, 100.0]}, (0.01, 100.0)),
+     ({"choices": ["p", "q", "r"]}, ("p", "r"))],
+)  # fmt: skip
+def test_a_draw_goes_from_the_first_end_to_the_last(given: dict[str, Any], ends: tuple[Any, Any]) -> None:
+    made = make_vary("a", given)
+    assert (made.is_grid, made.is_drawn) == (False, True)
+    # Quantiles are within 1e-12 of the ends.
+    for u, end in zip((1e-12, 1.0 - 1e-12), ends, strict=True):
+        value, label = made.pick(u)
+        assert value == label
+        assert value == (end if isinstance(end, str) else pytest.approx(end, rel=1e-9))
+    assert made.pick(1.0)[0] == (ends[1] if isinstance(ends[1], str) else pytest.approx(ends[1], rel=1e-12))
+    middle = {"uniform": 1.0, "log_uniform": 1.0, "choices": "q"}[made.kind]
+    assert made.pick(0.5)[0] == (middle if isinstance(middle, str) else pytest.approx(middle))
+    normal = make_vary("a", {"normal": [2, 0.5]})
+    assert normal.pick(0.5)[0] == pytest.approx(2.0)
+    assert normal.pick(0.9772498680518208)[0] == pytest.approx(3.0)  # two deviations
+
+
+def test_each_sample_has_a_seed_of_its_own_that_any_generator_takes() -> None:
+    found = points({"a": [1, 2], "s": {"seed": True}}, runs=399)
+    assert len(found) == 399
+    seeds = [found[run].seed for run in range(399)]
+    assert seeds[::2] == seeds[1::2] + seeds[-1:]  # both points of the grid, and the last sample has one
+    assert len(set(seeds)) == 200
+    assert all(0 <= seed < 2**31 - 2 for seed in seeds)
+    last = found[398]
+    assert (last.run, last.sample, last.values, last.labels) == (398, 199, {"a": 1, "s": seeds[-1]}, last.values)
+
+
+def test_numbers_of_runs_have_their_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_study, "_MAX_RUNS", 6)
+    assert len(points({"a": [1, 2, 3], "b": [1, 2]})) == len(points({"a": {"uniform": [0, 1]}}, 6)) == 6
+    assert len(points({"a": [1, 2, 3], "b": [1, 2]}, 6)) == 6
+    assert len(points({"a": [1, 2], "b": {"uniform": [0, 1]}}, 2)) == 2
+    assert len(points({"a": {"uniform": [0, 1]}}, 1)) == 1
+    with pytest.raises(SettingsError, match="the grid has 8 points; at most 6 fit"):
+        points({"a": [1, 2, 3, 4], "b": [1, 2]})
+    for runs in (7, 0, True):
+        with pytest.raises(SettingsError, match="between 1 and 6"):
+            points({"a": {"uniform": [0, 1]}}, runs)
+    with pytest.raises(SettingsError, match="`runs` is missing"):
+        points({"s": {"seed": True}})
+
+
+@pytest.mark.parametrize(
+    ("given", "fits"),
+    [({"uniform": [0, True]}, False), ({"uniform": (0, 1)}, True), ({"uniform": "01"}, False),
+     ({"uniform": [0.0, float("inf")]}, False), ({"uniform": [0, 1, 2]}, False), ({"normal": [5.0, 1e-9]}, True),
+     ({"normal": [1.0, 0.5]}, True), ({"normal": [0.0, -1.0]}, False), ({"log_uniform": [1e-9, 1.0]}, True),
+     ({"log_uniform": [-1.0, 1.0]}, False), ({"uniform": [-1.0, 0.0]}, True), ({"grid": "ab"}, False),
+     ({"grid": [1, "1"]}, True), ({}, False), ({"seed": True}, True), ({"seed": 1}, False)],
+)  # fmt: skip
+def test_a_range_is_two_numbers_in_their_order(given: Any, fits: bool) -> None:
+    if fits:
+        assert make_vary("k", make_vary("k", given)).kind == next(iter(given))
+        return
+    with pytest.raises(SettingsError, match="`k`"):
+        make_vary("k", given)
+
+
+@pytest.mark.parametrize("run", [-1, 4, 99])
+def test_a_study_has_its_runs_and_settings_within_their_ranges(run: int) -> None:
+    loop = {"duration_s": 1.0, "plant": {"neck": "paper"}, "reference": {"kind": "step", "pitch_deg": 5.0, "at_s": 0.2}}
+    made = _study.make_study(loop, vary={"reference.pitch_deg": [1.0, 2.0], "duration_s": [3.0, 4.0]})
+    assert [made.table(k)["duration_s"] for k in (0, 3)] == [3.0, 4.0]
+    with pytest.raises(SettingsError, match=f"the study has runs 0 to 3; there is no run {run}"):
+        made.table(run)
+    for seed in (-1, True, 2.5):
+        with pytest.raises(SettingsError, match="`seed` must be"):
+            replace(made, seed=seed)  # pyright: ignore[reportArgumentType]
+    for dask in ("head:8786", 5, ""):
+        with pytest.raises(SettingsError, match="`dask` must be"):
+            replace(made, dask=dask)  # pyright: ignore[reportArgumentType]
+    assert replace(made, seed=0, dask="tcp://head:8786").dask == "tcp://head:8786"
