@@ -76,6 +76,12 @@ _REGION, _WIDEN = 0.12, 1.0
 _MOVED_OVER = 2.5
 # Runs are left out in so many groups at most; a group of fewer rows says nothing of a simulation.
 _MOST_GROUPS, _LEAST_ROWS = 3, 10 * WARM_UP
+# Kinds of set-points: held between jumps, or moving all the time.
+JUMPS, SMOOTH = "jumps", "smooth motions"
+# Of a motor's range: set-points that change by less from one row to the next are held.
+_AT_REST = 1e-6
+# Of an output's spread in training: what moves less has a fit that says nothing.
+_MOVED = 0.6
 # Errors within 2 s of each other belong together: that is ten time constants of the neck.
 _BLOCK_SAMPLES = 100
 # The standard error itself is then known to 5 %.
@@ -129,6 +135,9 @@ def folds(train: Recording, hold_out: Recording, *, other_excitation: bool) -> l
     found = [Fold(blanked, tuple(judged))] if judged else []
     for number, (group, others) in enumerate(_groups(train), start=1):
         found.append(Fold(_first_rows(others)[0], (all_rows(f"excitation {number}", group),)))
+    if len(train.runs()) == 1 and (phases := _by_phase(train)):
+        for name, others in ((JUMPS, SMOOTH), (SMOOTH, JUMPS)):
+            found.append(Fold(_first_rows(phases[others])[0], (all_rows(name, phases[name]),)))
     if other_excitation and len(hold_out) >= _LEAST_ROWS:
         found.append(Fold(_first_rows(hold_out)[0], (all_rows("trained on the other", head),)))
     return found
@@ -154,6 +163,43 @@ def _groups(train: Recording) -> list[tuple[Recording, Recording]]:
         group, others = list(runs[start:stop]), [*runs[:start], *runs[stop:]]
         if min(sum(map(len, part)) for part in (group, others)) >= _LEAST_ROWS:
             found.append((concatenate(group), concatenate(others)))
+    return found
+
+
+def _phases(run: Recording) -> list[tuple[str, int, int]]:
+    """Return the parts (name, start, stop) of a run in which set-points are held between jumps, or move all the time.
+
+    A run of `mixed` has both: its signals follow each other.
+    """
+    U = run.set_points
+    moved = (np.abs(np.diff(U, axis=0, prepend=U[:1])) > _AT_REST * np.ptp(U, axis=0)).any(axis=1).astype(float)
+    around, reach = np.pad(moved, _LEAST_ROWS // 4, mode="edge"), 2 * (_LEAST_ROWS // 4) + 1
+    held = np.convolve(around, np.full(reach, 1.0 / reach), mode="valid") < 0.5
+    edges = [0, *(np.flatnonzero(np.diff(held)) + 1).tolist(), len(U)]
+    return [(JUMPS if held[start] else SMOOTH, start, stop) for start, stop in itertools.pairwise(edges)]
+
+
+def _by_phase(run: Recording) -> dict[str, Recording]:
+    """Return the jumps of a run and its other motions; {} if all is alike."""
+    phases = [(name, run.rows(start, stop)) for name, start, stop in _phases(run) if stop - start >= _LEAST_ROWS]
+    found = {name: [rows for kind, rows in phases if kind == name] for name in (JUMPS, SMOOTH)}
+    return {name: concatenate(rows) for name, rows in found.items()} if all(found.values()) else {}
+
+
+def motions_held_out(hold_out: Recording, train: Recording) -> list[Judged]:
+    """Return the rows held out of each of several motions, but those in which an output hardly moves."""
+    if not other_motion(train):
+        return []
+    spread, scored, found, first = np.nanstd(train.outputs, axis=0), _scored_rows(hold_out), [], 0
+    for number, run in enumerate(hold_out.runs(), start=1):
+        for kind in (JUMPS, SMOOTH):
+            rows = np.zeros(len(hold_out), dtype=bool)
+            for name, start, stop in _phases(run):
+                rows[first + start : first + stop] = name == kind
+            y = hold_out.outputs[rows := rows & scored]
+            if len(y) >= _LEAST_ROWS and (np.nanstd(y, axis=0) > _MOVED * spread).all():
+                found.append(Judged(f"{kind} held out of run {number}", hold_out, rows))
+        first += len(run)
     return found
 
 
@@ -241,10 +287,10 @@ _SAME_MOTION = 1.25
 
 
 def other_motion(recording: Recording) -> bool:
-    """Return whether the runs are of different motions."""
+    """Return whether the runs are of different motions, or the only run is of several."""
     moves = [run.set_points for run in recording.runs() if len(run) > 1]
-    if not moves:
-        return False
+    if len(moves) < 2:
+        return bool(moves) and bool(_by_phase(recording))
     sizes = np.array([[U.std(axis=0), np.diff(U, axis=0).std(axis=0)] for U in moves])
     low, high = sizes.min(axis=0), sizes.max(axis=0)
     return bool((high > _SAME_MOTION * low + 1e-9 * high.max()).any())

@@ -24,7 +24,17 @@ from softneck.core import (
 from softneck.signals import Recording, poor_excitation
 
 from ..models._arrays import members
-from ..models._left_out import Fold, agreement, all_rows, exams, folds, free_runs, other_motion, samples_to_judge
+from ..models._left_out import (
+    Fold,
+    agreement,
+    all_rows,
+    exams,
+    folds,
+    free_runs,
+    motions_held_out,
+    other_motion,
+    samples_to_judge,
+)
 from ..models._linear_systems import KINDS as LINEAR
 from ..models._model import Model
 from ..models._validity import calibrate_validity
@@ -397,7 +407,8 @@ class _Race:
         except Exception as error:  # one kind never ends the search
             self.tried["guarded"] = KindTrial("guarded", time.perf_counter() - begin, failure=_reason(error))
             return best
-        outputs = {**best.outputs, HOLD_OUT: all_rows(HOLD_OUT, self.hold_out).fits(model)[0]}
+        fits = all_rows(HOLD_OUT, self.hold_out).fits(model)[0]
+        outputs = {**best.outputs, HOLD_OUT: fits, **self._each_held_out(model)}
         outputs.pop(SECOND, None)  # of its kind alone: where two trainings part, the base is taken
         one = KindTrial(
             "guarded", time.perf_counter() - begin, model, judged, "", best.left_out, best.errors, outputs=outputs
@@ -426,7 +437,7 @@ class _Race:
                 model = calibrate_validity(model, self.short[kind], *unseen_rows(self.folds[0]))
             judged = self._validate(kind, model)
             fits, error = all_rows(HOLD_OUT, self.hold_out).fits(model)
-            outputs = {**one.outputs, HOLD_OUT: fits}
+            outputs = {**one.outputs, HOLD_OUT: fits, **self._each_held_out(model)}
             if self.folds[0].judged:
                 outputs[SECOND] = second_training(model, self.short[kind], self.folds[0])
         except Exception as error:  # one kind never ends the search
@@ -434,6 +445,9 @@ class _Race:
             return
         one = replace(one, seconds=one.seconds + time.perf_counter() - begin, errors={**one.errors, HOLD_OUT: error})
         self.tried[kind] = replace(one, model=model, judged=judged, whole=True, outputs=outputs)
+
+    def _each_held_out(self, model: Model) -> dict[str, Fits]:
+        return {part.name: part.fits(model)[0] for part in motions_held_out(self.hold_out, self.train)}
 
     def _simplest_of_the_best(self) -> KindTrial:
         ranking = self.ranking()

@@ -14,7 +14,7 @@ import pytest
 from softneck.core import DataError, silent
 from softneck.identification import Model, Play, SetMembership, identify, with_tolerance
 from softneck.identification.models import _left_out
-from softneck.identification.models._left_out import Judged, folds, standard_error
+from softneck.identification.models._left_out import Judged, folds, motions_held_out, standard_error
 from softneck.identification.models._scores import nrmse_fit
 from softneck.identification.models._validity import calibrate_validity, tolerance_of
 from softneck.identification.selection._examination import (
@@ -26,9 +26,9 @@ from softneck.identification.selection._examination import (
 )
 from softneck.identification.structured._greybox import GreyBox
 from softneck.robot import Robot
-from softneck.signals import Recording, concatenate
+from softneck.signals import Recording, concatenate, signal
 
-from ...data import neck_recording, recording_from
+from ...data import TS, neck_recording, recording_from
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +61,8 @@ def test_the_summary_begins_with_it_and_says_what_to_record(model: Model) -> Non
     assert f"{found['fit']:.1f} % at its worst ({found['part']}, {found['output']})" in line
     assert f"on other motions {found['expected']:.0f} % ({found['low']:.0f} to {found['high']:.0f} %)" in line
     assert "one motion is too little" in line
+    # Downwards one motion says little: twice as far as upwards, or further.
+    assert found["expected"] - found["low"] > 2.0 * (found["high"] - found["expected"])
     assert "softneck record mixed" in line
 
 
@@ -68,8 +70,43 @@ def test_two_motions_leave_each_other_out_as_a_whole() -> None:
     two = identify("rls", [neck_recording(1500), recording_from(2.0 * neck_recording(1500, seed=2).set_points)])
     found = two.findings["examination"]
     assert {"excitation 1", "excitation 2"} <= found["parts"].keys()
-    assert not found["parts"].keys() & {"largest motions", "fastest motions", "later block"}
+    assert not found["parts"].keys() & {"largest motions", "fastest motions", "later block", "second training"}
     assert "one motion" not in two.summary()
+
+
+def jumps_after_smooth_motions(rows: int) -> np.ndarray:
+    """Set-points (2 rows, 3) that move all the time, then are held for 1 s between jumps."""
+    smooth = signal("eq22", duration=rows * TS).set_points
+    jumps = np.random.default_rng(1).uniform(-4.0, 4.0, (rows // 50 + 1, 3)).repeat(50, axis=0)[:rows]
+    return np.vstack([smooth, jumps])
+
+
+def test_one_run_of_several_phases_leaves_each_out_as_a_whole() -> None:
+    found = identify("rls", recording_from(jumps_after_smooth_motions(1000))).findings["examination"]
+    assert not found["one_motion"]
+    # Narrower than with one motion, whose interval reaches 30 points down.
+    assert found["high"] - found["low"] < 30.0
+    assert {"jumps", "smooth motions", "jumps held out of run 1"} <= found["parts"].keys()
+    assert not found["parts"].keys() & {"largest motions", "second training"}
+
+
+def test_the_border_of_phases_is_found_and_short_phases_are_none() -> None:
+    U = jumps_after_smooth_motions(1000)
+    # What is jumps is left out of the training on what is smooth; a window of 2.5 s has its middle within a few rows.
+    folded = {fold.judged[0].name: fold for fold in folds(recording_from(U), recording_from(U), other_excitation=False)}
+    assert abs(len(folded["jumps"].judged[0].recording) - 1000) <= 10
+    assert abs(len(folded["jumps"].train) - 1000) <= 10
+    assert not other_motion(recording_from(U[:1200]))
+
+
+def test_held_out_motions_in_which_an_output_hardly_moves_are_no_part() -> None:
+    recording = recording_from(jumps_after_smooth_motions(1000))
+    names = [part.name for part in motions_held_out(recording, recording)]
+    assert names == ["jumps held out of run 1", "smooth motions held out of run 1"]
+    # Of the whole recording's spread less than 0.6 is left.
+    pitch = np.where(np.arange(len(recording)) < 1000, 1.0, 0.3) * recording.outputs[:, 0]
+    changed = recording.with_channels(pitch=pitch)
+    assert [part.name for part in motions_held_out(changed, recording)] == names[1:]
 
 
 def test_the_same_motion_twice_is_one_motion() -> None:
