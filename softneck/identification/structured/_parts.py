@@ -22,6 +22,8 @@ _STEPS = 4
 # What a part must gain [points]: seeds of the noise move fits by as much. With one motion what was left out resembles
 # the rest: laws of amplitude and time must also gain this share of what is missing to 100 %.
 _LEAST_GAIN, _LEAST_SHARE = 0.5, 0.15
+# Parts that were searched at once are dropped again where taking them out costs no more [points].
+_HARDLY = 0.1
 
 
 def parts_of(body: str) -> tuple[str, ...] | None:
@@ -61,8 +63,15 @@ class _Trial:
     found: Found
     judged: list[tuple[Judged, FitProblem]]
 
-    def extended(self, part: str, evaluations: int, tell: SearchProgress) -> _Trial:
-        return replace(self, found=extend(self.found, [part], evaluations, tell))
+    def extended(self, parts: Sequence[str], evaluations: int, tell: SearchProgress) -> _Trial:
+        return replace(self, found=extend(self.found, parts, evaluations, tell))
+
+    def without(self, part: str) -> _Trial:
+        """Return the trial with that part's numbers taken out, and the others as they are."""
+        at, problem = self.found, self.found.problem
+        kept = np.array([number not in PARTS[part] for number in problem.numbers])
+        numbers = tuple(number for number in problem.numbers if number not in PARTS[part])
+        return replace(self, found=replace(at, problem=replace(problem, numbers=numbers), x=at.x[kept]))
 
     def fit(self) -> float:
         """Return the worst fit of an output on what was left out [%]."""
@@ -81,35 +90,66 @@ def choose_parts(
 ) -> tuple[Found, dict[str, object]]:
     """Return the fit with the parts that motions left out confirm, and for each the worst fit to these [%].
 
-    Forward selection: of all parts the one whose fits to what trainings did not see have the best worst, as long as it
-    gains. Left out are whole runs where they are of different motions, else the largest and the fastest motions.
+    Forward selection: of all parts, and of all that are left at once, those whose fits to what trainings did not see
+    have the best worst, as long as it gains. Left out are whole runs where they are of different motions, else the
+    largest and the fastest motions, and the phases of a run.
     """
     left_out, several = folds(scaled.data, scaled.data, other_excitation=False), other_motion(scaled.data)
-    left_out = left_out[1:] if several else left_out
-    trials = [_trial(found, scaled, fold, min(evaluations, _STEPS), tell) for fold in left_out]
+    left_out = left_out[1:] if several and len(scaled.data.runs()) > 1 else left_out
+    steps = min(evaluations, _STEPS)
+    trials = sorted((_trial(found, scaled, fold, steps, tell) for fold in left_out), key=_Trial.fit)
     least = min((one.fit() for one in trials), default=np.inf)
-    left, kept = _able(found.problem), {"rigid": least}
+    left, kept, chosen = _able(found.problem), {"rigid": least}, []
     while left and trials:
-        tried: dict[str, list[_Trial]] = {}
-        for part in left:
-            tell.what = f"parts: {part}"
-            tried[part] = [one.extended(part, min(evaluations, _STEPS), tell) for one in trials]
-        fits = {part: min(one.fit() for one in extended) for part, extended in tried.items()}
-        more = {part: 0.0 if several or part == GEOMETRY else _LEAST_SHARE * (100.0 - least) for part in left}
-        good = [part for part in left if fits[part] > least + max(_LEAST_GAIN, more[part])]
+        tried = {}
+        for parts in [(part,) for part in left] + [tuple(left)] * (len(left) > 1):
+            tell.what = f"parts: {', '.join(parts)}"
+            tried[parts] = _extended(trials, parts, least, steps, tell)
+        fits = {parts: fit for parts, (fit, _) in tried.items()}
+        more = 0.0 if several else _LEAST_SHARE * (100.0 - least)
+        good = [one for one in fits if fits[one] > least + max(_LEAST_GAIN, 0.0 if one == (GEOMETRY,) else more)]
         if not good:
             break
-        best = max(good, key=lambda part: fits[part])
-        left = [part for part in left if part != best and fits[part] > least]
-        trials, least = tried[best], fits[best]
-        kept[best] = least
-    if len(kept) == 1:
+        best = max(good, key=lambda parts: fits[parts])
+        left = [part for part in left if part not in best and fits[(part,)] > least]
+        least, trials = tried[best]
+        if len(best) > 1:
+            least, trials, best = _needed(trials, best)
+        kept["+".join(best)] = least
+        chosen += best
+    if not chosen:
         return found, {}
     tell.what = "parts"
-    larger = found.problem.as_sure_as(found.x, found.delay).with_parts(*list(kept)[1:])
+    larger = found.problem.as_sure_as(found.x, found.delay).with_parts(*chosen)
     # A simulation that diverged has no number.
     said: dict[str, object] = {"parts": {part: max(fit, 0.0) for part, fit in kept.items()}}
     return larger.search(trials[0].found.x, found.delay, evaluations, tell), said
+
+
+def _extended(
+    trials: list[_Trial], parts: Sequence[str], least: float, steps: int, tell: SearchProgress
+) -> tuple[float, list[_Trial]]:
+    """Return the worst fit [%] of trials with more parts, and these; the rest is left where one gains nothing."""
+    found, worst = [], np.inf
+    for one in trials:
+        found.append(one.extended(parts, steps, tell))
+        worst = min(worst, found[-1].fit())
+        if worst <= least:
+            break
+    return worst, found
+
+
+def _needed(trials: list[_Trial], parts: Sequence[str]) -> tuple[float, list[_Trial], tuple[str, ...]]:
+    """Return worst fit, trials and parts without those that the fits hardly need."""
+    at_first = min(one.fit() for one in trials)
+    while len(parts) > 1:
+        tried = {part: [one.without(part) for one in trials] for part in parts}
+        fits = {part: min(one.fit() for one in shorter) for part, shorter in tried.items()}
+        idle = max(parts, key=lambda part: fits[part])
+        if fits[idle] < at_first - _HARDLY:
+            break
+        trials, parts = tried[idle], [part for part in parts if part != idle]
+    return min(one.fit() for one in trials), trials, tuple(parts)
 
 
 def _trial(found: Found, scaled: ScaledData, fold: Fold, evaluations: int, tell: SearchProgress) -> _Trial:
