@@ -5,8 +5,8 @@
 `virtual` is Eq. 22 on the virtual neck and its three tests, `payload` the lab's neck in closed loop (trained on 0 and
 1000 g, tested on 400 g), `arm` its arm (read pitch); FOLDER holds these as for `hardware_fits.py`. SysIdentPy,
 scikit-learn and jax-sysid run in environments of their own, which are made under build/peers: they need other versions
-of numpy and jax than ours. `edmd` needs numpy alone. `mimo` is `rls` with one state space of all motors. Peers are
-given set-points and outputs, as their own examples are.
+of numpy and jax than ours. `edmd` and `n4sid` need numpy alone. `mimo` is `rls` with one state space of all motors.
+Peers are given set-points and outputs, as their own examples are.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from softneck.core import KINDS, SoftneckError, resolve
 from softneck.identification import WARM_UP, nrmse_fit
 from softneck.signals import Recording
 
-PACKAGES = {"frols": ["sysidentpy"], "mlp": ["scikit-learn"], "jax_sysid_nss": ["jax-sysid"], "edmd": []}
+PACKAGES = {"frols": ["sysidentpy"], "mlp": ["scikit-learn"], "jax_sysid_nss": ["jax-sysid"], "edmd": [], "n4sid": []}
 OURS: dict[str, tuple[str, dict[str, Any]]] = {
     "mimo": ("rls", {"structure": "mimo"}), "oe": ("oe", {}), "nlsm": ("nlsm", {"form": "residual"}),
     "play": ("play", {}), "greybox": ("greybox", {}), "nn": ("nn", {}),
