@@ -111,6 +111,8 @@ def command(
     else:
         _print(path, found, folder)
     if not found.holds:
+        if not found.failed:
+            raise CheckFailedError(f"{controller}: no requirement was computed, so none holds.")
         listed = ", ".join(verdict.requirement.metric for verdict in found.failed)
         raise CheckFailedError(f"{controller}: {len(found.failed)} requirement(s) do not hold: {listed}.")
 

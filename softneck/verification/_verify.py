@@ -88,8 +88,9 @@ class Verification(ReprMixin):
 
     @property
     def holds(self) -> bool:
-        """Whether no requirement fails."""
-        return all(verdict.holds is not False for verdict in self.verdicts)
+        """Whether no requirement fails and one is judged at least: where nothing was computed nothing holds."""
+        found = {verdict.holds for verdict in self.verdicts}
+        return True in found and False not in found
 
     @property
     def failed(self) -> list[Verdict]:

@@ -147,8 +147,10 @@ def test_the_data_that_a_metric_is_about_must_support_it(metric: str, why: list[
         assert reason(True, drawn=[decided]) == "loop"
 
 
-@pytest.mark.parametrize("holds", [[True, None], [True, False], [False, True], [None], [True, True]])
-def test_a_verification_holds_where_none_fails_and_counts_what_is_not_computed(holds: list[Any]) -> None:
+@pytest.mark.parametrize("holds", [[True, None], [True, False], [False, True], [None], [None, None], [True, True]])
+def test_a_verification_holds_where_some_are_judged_and_none_fails_and_counts_what_is_not_computed(
+    holds: list[Any],
+) -> None:
     item = Requirement("axes.sensitivity", "max", 2.0, True)
     verdicts = [Verdict(item, None if value is None else 1.5, value, {"row": k}, "open" * (value is None))
                 for k, value in enumerate(holds)]  # fmt: skip
@@ -159,10 +161,10 @@ def test_a_verification_holds_where_none_fails_and_counts_what_is_not_computed(h
     files = {"controller": ("pi.npz", "a" * 64)}
     found = Verification(verdicts=verdicts, evidence=evidence, controller=under, necks=[], files=files,
                          observer=holds[0] is True, requirements=make_requirements({}))  # fmt: skip
-    assert found.holds is (False not in holds)
+    assert found.holds is (True in holds and False not in holds)
     assert [verdict.worst["row"] for verdict in found.failed] == [k for k, value in enumerate(holds) if value is False]
     assert found.summary().startswith("all" if all(holds) else f"{holds.count(True)} of {len(holds)} requirements hold")
-    assert (", 1 is not computed" in found.summary()) is (None in holds)
+    assert (", 1 is not computed" in found.summary()) is (holds.count(None) == 1)
     assert "parallel order: 2 samples of delay" in found.order_words()
     said = found.contents({0: Path("worst.toml")})
     assert (said["holds"], said["observer"]) == (found.holds, holds[0] is True)
