@@ -18,7 +18,6 @@ LOOP = {"overshoot_pct": 10.0, "rise_s": 0.8, "settling_s": 1.5, "steady_rms_deg
 TUNE = {
     "sim.overshoot_pct": 5.0,
     "sim.steady_rms_deg": 0.15,
-    "track.circle_rms_deg": 3.0,  # distance to a reference without preview
     "track.ahead_rms_deg": 1.5,  # distance with the preview that is best for all plants
 }
 #: Of `softneck verify`: `step` on the worst plant of the box with noise, `neck` on necks that differ from the preset.

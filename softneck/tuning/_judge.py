@@ -6,12 +6,12 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, ClassVar
 
 import numpy as np
 
-from softneck.core import KINDS, DataError, SoftneckError, Vector, make_settings, resolve, to_si, worst
+from softneck.core import KINDS, DataError, SoftneckError, Vector, make_settings, resolve, silent, to_si, worst
 from softneck.design import AxisSettings, UncertainPlant, uncertain_plant
 from softneck.identification import payloads
 from softneck.loop import Loop, LoopResult, Reference, RobotReference, SensorFault, run_loop
@@ -21,6 +21,7 @@ from softneck.verification import (
     LARGE,
     SMALL,
     ControllerUnderTest,
+    Drawn,
     Plants,
     SimulationModel,
     all_plants,
@@ -34,6 +35,7 @@ from softneck.verification import (
     loops_under_test,
     make_simulation_model,
     margins,
+    run_drawn,
     run_steps,
     sources_of,
     start_of,
@@ -355,10 +357,24 @@ def loop_metrics(
 def margin_metrics(
     task: Task, ready: Ready, block: Block, order: str, observer: Block | None = None
 ) -> dict[str, float]:
-    """Return the margins by experiment on the simulation models."""
-    loops = loops_under_test(block, ready.own, task.asked.certificate, order=order, observer=observer)
-    found = crossing_values(crossings(loops, overall=True)) if loops else {}
-    return {name: worst(name, values) for name, (values, _) in found.items() if name.startswith("axes.")}
+    """Return the margins by experiment on the simulation models, and all that loops over the draws of families tell."""
+    asked, found = task.asked.certificate, {}
+    own = [plant for plant in ready.own if plant.name not in task.drawn]
+    loops = loops_under_test(block, own, asked, order=order, observer=observer)
+    for name, (values, _) in (crossing_values(crossings(loops, overall=True)) if loops else {}).items():
+        if name.startswith("axes."):
+            keep_worse(found, name, worst(name, values))
+    for drawn in search_draws(task, block, order, observer):
+        for metric, values in drawn.values.items():
+            keep_worse(found, metric, worst(metric, values))
+    return found
+
+
+def search_draws(task: Task, block: Block, order: str, observer: Block | None) -> list[Drawn]:
+    """Return the loops over the draws of each family that a search may see."""
+    drawn = {name: family.draws for name, family in task.linear.items() if getattr(family, "draws", None) is not None}
+    run = partial(run_drawn, order=order, observer=observer, attempt=0, progress=silent)
+    return [run(name, draws, block, task.asked.certificate) for name, draws in drawn.items()]
 
 
 def loop_curves(

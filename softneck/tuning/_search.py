@@ -1,6 +1,7 @@
 """Search over kinds and settings by successive halving and CMA-ES.
 
-Each kind starts with the largest bound on Ms that its margins allow, found by bisection, and is judged there by loops.
+Each kind starts with the largest bound on Ms that its margins allow, found by bisection, and is judged there by loops;
+where draws of a family decide, also at a smaller one.
 After the start and each round the better third of the kinds continues (successive halving: Jamieson and Talwalkar
 2016, AISTATS). Each kind has its own CMA-ES over its unit cube (Hansen and Ostermeier 2001, Evolutionary Computation
 9:159). It uses ranks alone, so candidates of different levels can be mixed. At least half of the candidates continue
@@ -17,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Progress, SoftneckError
+from softneck.core import Progress, SoftneckError, worst
 from softneck.cosim import WorkerPool
 from softneck.verification import Requirement
 
 from ._judge import LEVELS, judge_candidate
 from ._space import COSTLY, Space
-from ._task import MARGINS, Job, Judgement, Log, Task
+from ._task import Job, Judgement, Log, Task
 
 # 4 + 3 ln n, the default of CMA-ES, for two to four settings, made even.
 _POPULATION_SIZE = 6
@@ -34,7 +35,7 @@ _START_STEP, _START_STEPS = 0.24, 3
 # Share of the budget for neighbours of the best, and their first and last distance.
 _REFINED_SHARE, _FIRST_DISTANCE, _LAST_DISTANCE = 0.3, 0.08, 0.005
 # Kinds that always continue, and final candidates with margins by experiment.
-_MIN_KINDS, _FINAL_COUNT = 2, 3
+_MIN_KINDS, _FINAL_COUNT = 2, 4
 # One kind in three continues to the next round.
 _HALVING_RATE = 3
 # Weight of the mean ratio beside the largest one, which breaks ties.
@@ -68,9 +69,9 @@ class Candidate:
             return
         self.level = level
         self.curves = judgement.curves or self.curves
-        # The smaller of the margins by linear methods and by experiment counts.
+        # The worse value counts: of margins by linear methods and by experiment, of steps on few draws and on many.
         self.metrics |= {
-            name: min(value, self.metrics.get(name, math.inf)) if name in MARGINS else value
+            name: worst(name, [value, self.metrics[name]]) if name in self.metrics else value
             for name, value in judgement.metrics.items()
         }
 
@@ -175,11 +176,11 @@ class Search:
         self._finish(finals)
 
     def _finish(self, finals: int) -> None:
-        """Search near the best, and judge the margins of the final candidates by experiment."""
+        """Search near the best, and judge the final candidates, of each kind one first, by margins and all draws."""
         self._refine(self.levels, finals)
         if finals:
             last = [item for item in self.sort_candidates() if item.level == self.levels[-1]]
-            self._judge(last[:finals], "margins", 0)
+            self._judge(best_of_kinds(last)[:finals], "margins", 0)
 
     def sort_candidates(self) -> list[Candidate]:
         """Return all candidates with metrics, the best first."""
@@ -206,11 +207,20 @@ class Search:
         starts = self._move_starts(starts, finals + (len(levels) - 1) * len(starts))
         for level in levels[1:]:
             self._judge(list(starts.values()), level, finals)
+        if self.task.drawn:
+            starts = self._judge_calmer(starts, levels, finals)
         self.dropped |= {kind: item.error for kind, item in starts.items() if item.error}
         for number, space in enumerate(self.spaces):
             if not np.array_equal(starts[space.kind].x, space.start):
                 optimisers[space.kind] = _optimiser(space, self.task.seed, number, starts[space.kind].x)
         return self._drop_kinds([space for space in self.spaces if space.kind not in self.dropped])
+
+    def _judge_calmer(self, starts: dict[str, Candidate], levels: Sequence[str], finals: int) -> dict[str, Candidate]:
+        """Return the better of each start and of a slower one: at its limits of margins a kind overshoots."""
+        calmer = {space.kind: self._candidate(space, space.calmer(starts[space.kind].x)) for space in self.spaces}
+        for level in levels:
+            self._judge(list(calmer.values()), level, finals)
+        return {kind: min(starts[kind], calmer[kind], key=self._rank) for kind in starts}
 
     def _move_starts(self, starts: dict[str, Candidate], reserved: int) -> dict[str, Candidate]:
         """Return the starts with the largest bound on Ms that the margins allow, by bisection."""
@@ -343,6 +353,12 @@ def run_jobs(
         raise SoftneckError(
             "a worker process died (out of memory, or a plant that crashed); run the same command again to continue."
         ) from error
+
+
+def best_of_kinds(ranked: Sequence[Candidate]) -> list[Candidate]:
+    """Return candidates, the best of each kind first."""
+    first = {item.kind: item for item in reversed(ranked)}
+    return [*sorted(first.values(), key=ranked.index), *(item for item in ranked if item is not first[item.kind])]
 
 
 def in_words(item: Candidate, cost: float) -> str:

@@ -30,6 +30,7 @@ from softneck.robot import Robot, Scaling, load_for_robot
 from softneck.signals import require_same_robot
 from softneck.verification import (
     LARGE,
+    Drawn,
     Requirement,
     Scale,
     SimulationModel,
@@ -44,7 +45,7 @@ from softneck.verification import (
     with_robot,
 )
 
-from ._judge import LEVELS, design_candidate, keep_worse, loop_of, make_observer, prepare, told_conditions
+from ._judge import LEVELS, design_candidate, keep_worse, loop_of, make_observer, prepare, search_draws, told_conditions
 from ._requirements import (
     USUAL_RISE,
     TuneRequirements,
@@ -55,21 +56,23 @@ from ._requirements import (
     read_tune_requirements,
     relax_limits,
 )
-from ._search import Candidate, Search, ratio
+from ._search import Candidate, Search, best_of_kinds, ratio
 from ._space import KINDS_SEARCHED, UNCERTIFIED, spaces
-from ._task import Log, Task, digest_of
+from ._task import MARGINS, Log, Task, digest_of
 
 #: Default number of judgements of candidates.
 BUDGET = 160
-# Draws of a family among the plants of a search; its certificates have others.
-_SEARCHED_DRAWS = 2
+# Draws of a family in every loop of a search; final candidates are judged on more, and certificates have others.
+_SEARCHED_DRAWS = 4
 # Number of the best candidates that are verified until one holds.
 _MAX_VERIFICATIONS = 2
 # Number of all verifications, if a family has draws for so many.
 _MAX_ATTEMPTS = 6
 # Where a certificate fails: the number of its draws that join the search, of candidates with which it resumes, and its
 # share of the budget.
-_MORE_DRAWS, _RESUMED, _RESUMED_SHARE = 2, 6, 0.4
+_MORE_DRAWS, _RESUMED, _RESUMED_SHARE = 3, 6, 0.4
+# Speeds whose default is relaxed, without another search, where the best misses it by no more than this factor.
+_SPEED_METRICS, _NEAR = ("sim.rise_s", "sim.settling_s"), 1.15
 _UNCERTIFIED_REASON = "beside recordings nothing is certified of it; name it in --kinds to search it all the same"
 # Smaller co-contractions, of a neck, set no rule.
 _MIN_COCONTRACTION_RAD = 0.05
@@ -262,34 +265,67 @@ def _certify_search(
 
     Where draws of the certificate fail, the worst of them join the plants and the search resumes from its best.
     """
-    certified, tried = _verify_best(search, 0, files, progress)
-    failing = {} if certified.verification.holds else _failing_draws(certified.verification)
-    if not failing or tried >= _most_attempts(search.task):
-        return search, certified, tried
-    task = search.task
+    task, best = search.task, search.sort_candidates()[:1]
+    failed = _failed_in_search(task, best[0]) if best else []
+    drawn = _drawn_in_search(task, best[0]) if failed else []
+    certified, tried = (None, 0) if failed else _verify_best(search, 0, files, progress)
+    if certified is not None:
+        verification = certified.verification
+        if not (verification.holds or _is_near(certified.item, verification.failed, task)):
+            failed, drawn = verification.failed, verification.evidence.drawn
+        if not drawn or tried >= _most_attempts(task):
+            return search, certified, tried
+    failing = _failing_draws(drawn, failed)
     digest = hashlib.sha256("\n".join([task.digest, *failing]).encode()).hexdigest()
-    more = replace(task, own={**task.own, **failing}, drawn=(*task.drawn, *failing), digest=digest)
+    more = replace(
+        task, own={**task.own, **failing}, drawn=(*task.drawn, *failing), digest=digest,
+        asked=replace(task.asked, kept=_more_kept(task.asked.kept, failed)),
+    )  # fmt: skip
     prepare(more)
     again = replace(
         search, task=more, log=Log(None, digest), budget=round(_RESUMED_SHARE * search.budget), candidates={},
         spent=set(), earlier=len(search.spent),
     )  # fmt: skip
-    again.resume(_best_of_kinds(search.sort_candidates())[:_RESUMED])
-    if not again.sort_candidates():
-        return search, certified, tried
-    return again, *_verify_best(again, tried, files, progress)
+    again.resume(best_of_kinds(search.sort_candidates())[:_RESUMED])
+    if again.sort_candidates() or certified is None:
+        search = again if again.sort_candidates() else search
+        certified, tried = _verify_best(search, tried, files, progress)
+    return search, certified, tried
 
 
-def _best_of_kinds(ranked: Sequence[Candidate]) -> list[Candidate]:
-    """Return candidates, the best of each kind first."""
-    first = {item.kind: item for item in reversed(ranked)}
-    return [*sorted(first.values(), key=ranked.index), *(item for item in ranked if item is not first[item.kind])]
+def _is_near(item: Candidate, failed: Sequence[Verdict], task: Task) -> bool:
+    """Return whether defaults of speed alone fail, by little: they are relaxed instead."""
+    missed = relaxations(item, failed, task.asked)
+    return bool(missed) and all(
+        metric in _SPEED_METRICS and one.reached <= _NEAR * one.default for metric, one in missed.items()
+    )
 
 
-def _failing_draws(verification: Verification) -> dict[str, Any]:
-    """Return name -> the draws of a certificate with the worst values of what fails."""
+def _failed_in_search(task: Task, item: Candidate) -> list[Verdict]:
+    """Return what a candidate fails on the draws that a search may see; none if it is near."""
+    found = item.metrics
+    failed = [Verdict(b, found[b.metric], False, {}) for b in task.bounds
+              if task.drawn and b.metric in found and not b.holds(found[b.metric])]  # fmt: skip
+    return [] if _is_near(item, failed, task) else failed
+
+
+def _drawn_in_search(task: Task, item: Candidate) -> list[Drawn]:
+    controller = design_candidate(task, prepare(task), item.kind, item.settings)
+    order = str(getattr(controller, "order", "sequential"))
+    return search_draws(task, controller.block(), order, make_observer(task, item.kind))
+
+
+def _more_kept(kept: Mapping[str, float], failed: Sequence[Verdict]) -> dict[str, float]:
+    """Return how far a search stays within its limits where draws have smaller margins than the plants that led it."""
+    short = {v.requirement.metric: v.requirement.limit - (v.value or 0.0) for v in failed
+             if v.requirement.metric in MARGINS and v.requirement.metric in kept}  # fmt: skip
+    return {metric: value + short.get(metric, 0.0) for metric, value in kept.items()}
+
+
+def _failing_draws(drawn: Sequence[Drawn], failed: Sequence[Verdict]) -> dict[str, Any]:
+    """Return name -> the draws with the worst values of what fails."""
     found = {}
-    for part, verdict in product(verification.evidence.drawn, verification.failed):
+    for part, verdict in product(drawn, failed):
         bound = verdict.requirement
         model = part.worst(bound.metric, largest=bound.bound != "min")
         if model is not None:

@@ -58,7 +58,7 @@ class Drawn:
     Attributes:
         family: its name.
         draws: of the family.
-        attempt: whose draws these are, from 1 on.
+        attempt: whose draws these are, from 1 on; 0: those that a search may see.
         count: of draws that were run.
         values: metric -> (n,) of all loops that tell it; of margins those of the draws that swing most.
         conditions: metric -> draw and condition of each value.
@@ -86,7 +86,7 @@ class Drawn:
             return None
         values = np.nan_to_num(self.values[metric], nan=math.inf if largest else -math.inf)
         row = int(np.argmax(values) if largest else np.argmin(values))
-        return self.draws.for_certificate(self.attempt)[self.conditions[metric][row]["draw"]]
+        return _models(self.draws, self.attempt)[self.conditions[metric][row]["draw"]]
 
     def statement(self) -> str:
         """Return what the loops over the draws say."""
@@ -146,31 +146,31 @@ class _Margin:
 
 def run_drawn(
     name: str, draws: Draws, controller: Block, asked: Requirements, *, order: str, observer: Block | None,
-    attempt: int, progress: Progress, count: int | None = None, search: bool = False,
+    attempt: int, progress: Progress,
 ) -> Drawn:  # fmt: skip
     """Run all loops over the draws of a family.
 
     Steps of every required direction at the lightest and the heaviest payload, with the disturbance of the draws, the
     sensor's noise, and a load after the step; and each required margin at three amplitudes. Of the draws that swing
-    most there the margin itself is bisected. `search` takes the draws that a search may see, at most `count`. Equal
+    most there the margin itself is bisected. Attempt 0 takes the draws that a search may see. Equal
     loops are run once in a process, as those of a controller that `tune` has verified.
     """
     limits = [(b.metric, b.bound, b.limit) for b in asked.bounds if b.metric.startswith("sim.") or b.metric in _MARGINS]
 
     def compute() -> Drawn:
-        return _run_all(name, draws, controller, asked, order, observer, attempt, progress, count, search)
+        return _run_all(name, draws, controller, asked, order, observer, attempt, progress)
 
     found = compute_once(
-        compute, name, draws, controller, asked.tables, limits, order, observer, attempt, count, search
+        compute, name, draws, controller, asked.tables, limits, order, observer, attempt
     )  # fmt: skip
     return replace(found, unreached=_unreached(draws, asked))
 
 
 def _run_all(
     name: str, draws: Draws, controller: Block, asked: Requirements, order: str, observer: Block | None, attempt: int,
-    progress: Progress, count: int | None, search: bool,
+    progress: Progress,
 ) -> Drawn:  # fmt: skip
-    models = draws.for_search(count or len(draws.for_search())) if search else draws.for_certificate(attempt)
+    models = _models(draws, attempt)
     plants = [make_simulation_model(model, f"draw {k + 1} of {name}", asked.robot) for k, model in enumerate(models)]
     inverse = asked.robot.redefinition(directions_of(draws.model))[1]
     task = _Task(
@@ -215,6 +215,10 @@ def _run_all(
         name, draws, attempt, len(plants), {metric: np.array(found) for metric, found in values.items()}, conditions,
         tuple(sorted(failed)),
     )  # fmt: skip
+
+
+def _models(draws: Draws, attempt: int) -> list[Model]:
+    return draws.for_certificate(attempt) if attempt else draws.for_search()
 
 
 def _required_margins(asked: Requirements) -> dict[str, float]:

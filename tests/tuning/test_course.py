@@ -45,6 +45,7 @@ def searched(monkeypatch: pytest.MonkeyPatch, budget: int, tested: bool = True, 
     monkeypatch.setattr(_search, "judge_candidate", judged)
     task: Any = SimpleNamespace(
         asked=SimpleNamespace(bounds=BOUNDS), bounds=BOUNDS, aims=BOUNDS, own={"neck": 0}, seed=0, tested=tested,
+        drawn=(),
     )  # fmt: skip
     each = spaces(("pi", "hinf"), rise=0.4, cocontraction=None, robot=Robot.preset())
     found = Search(task, each, WorkerPool(1, SameProcess()), Log(None, ""), budget, tell)

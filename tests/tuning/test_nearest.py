@@ -55,9 +55,7 @@ def test_a_slower_rise_than_the_default_is_told_and_certified_with_some_room() -
     assert again.bounds == asked.bounds
 
 
-@pytest.mark.parametrize(
-    "metric", ["sim.overshoot_pct", "sim.steady_rms_deg", "sim.settling_s", "track.circle_rms_deg"]
-)
+@pytest.mark.parametrize("metric", ["sim.overshoot_pct", "sim.steady_rms_deg", "sim.settling_s", "track.ahead_rms_deg"])
 def test_a_relaxed_limit_keeps_its_reserve_and_a_file_of_it_asks_for_the_same(metric: str) -> None:
     limit = 1.5 * bound(metric).limit
     asked = relax_limits(ASKED, {metric: limit})
@@ -73,7 +71,7 @@ def test_a_relaxed_limit_keeps_its_reserve_and_a_file_of_it_asks_for_the_same(me
 def test_the_worse_of_the_loops_with_noise_and_of_verify_counts() -> None:
     found = relaxations(candidate(sim__rise_s=0.7), [failed("sim.rise_s", 0.6)], ASKED)
     assert found["sim.rise_s"].reached == 0.7
-    assert list(relaxations(candidate(track__circle_rms_deg=3.5), [], ASKED)) == ["track.circle_rms_deg"]
+    assert list(relaxations(candidate(track__ahead_rms_deg=1.7), [], ASKED)) == ["track.ahead_rms_deg"]
 
 
 @pytest.mark.parametrize(

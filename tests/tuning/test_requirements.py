@@ -54,15 +54,15 @@ def test_the_defaults_are_those_of_verify_with_what_tuning_adds() -> None:
     assert set(theirs) <= set(mine)
     changed = {key for key in theirs if theirs[key] != mine[key]}
     assert changed == {("sim.overshoot_pct", "max"), ("sim.steady_rms_deg", "max")}
-    assert (asked.robot_limit("sim.rise_s"), asked.robot_limit("track.circle_rms_deg")) == (NECK_RISE_S, 3.0)
+    assert (asked.robot_limit("sim.rise_s"), asked.robot_limit("track.ahead_rms_deg")) == (NECK_RISE_S, 1.5)
 
 
 def test_a_reserve_is_taken_off_what_plants_must_keep_and_said() -> None:
-    table = {"require": {"sim.rise_s": {"max": 0.5}}, "reserve": {"sim.rise_s": 0.1, "track.circle_rms_deg": 0.0}}
+    table = {"require": {"sim.rise_s": {"max": 0.5}}, "reserve": {"sim.rise_s": 0.1, "track.ahead_rms_deg": 0.0}}
     asked = make_tune_requirements(table)
     assert (asked.limit("sim.rise_s"), asked.robot_limit("sim.rise_s")) == (0.4, 0.5)
-    assert asked.limit("track.circle_rms_deg") == asked.robot_limit("track.circle_rms_deg") == 3.0
-    assert {"sim.rise_s <= 0.4 (0.5 less a reserve of 0.1)", "track.circle_rms_deg <= 3"} <= set(asked.lines())
+    assert asked.limit("track.ahead_rms_deg") == asked.robot_limit("track.ahead_rms_deg") == 1.5
+    assert {"sim.rise_s <= 0.4 (0.5 less a reserve of 0.1)", "track.ahead_rms_deg <= 1.5"} <= set(asked.lines())
     # What verify is asked is what the plants must keep.
     assert asked.certificate.bounds == tuple(b for b in asked.bounds if not b.metric.startswith("track."))
 
@@ -70,13 +70,13 @@ def test_a_reserve_is_taken_off_what_plants_must_keep_and_said() -> None:
 def test_where_draws_decide_the_search_alone_stays_below_the_default_limit() -> None:
     drawn, known = make_tune_requirements({}, drawn=True), make_tune_requirements({})
     assert not drawn.reserve
-    assert drawn.kept == {**known.reserve, "axes.gain_margin": 0.4}
+    assert drawn.kept == {**known.reserve, "axes.gain_margin": 0.2}
     assert drawn.limit("sim.overshoot_pct") == known.robot_limit("sim.overshoot_pct")
     task = task_of({"n": neck()}, {}, 0)
     seen = replace(task, asked=drawn)
     aims, limits = ({b.metric: b.limit for b in bounds} for bounds in (seen.aims, seen.bounds))
     assert aims["sim.overshoot_pct"] == pytest.approx(known.limit("sim.overshoot_pct"))
-    assert aims["axes.gain_margin"] == limits["axes.gain_margin"] + 0.4
+    assert aims["axes.gain_margin"] == limits["axes.gain_margin"] + 0.2
     assert {name for name, limit in aims.items() if limit != limits[name]} == set(drawn.kept)
     assert replace(task, asked=known).aims == replace(task, asked=known).bounds
     # A reserve of one's own is taken off all limits, as without draws; a limit below it is aimed at itself.

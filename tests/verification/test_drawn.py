@@ -496,11 +496,11 @@ def run_with(
     monkeypatch.setattr(_drawn, "directions_of", lambda _: None)
     draws, told = told_draws(), list[float]()
     draws.for_certificate = lambda attempt: [attempt] * len(steps)
-    draws.for_search = lambda count=9: [0] * min(count, len(steps))
+    draws.for_search = lambda: [0] * len(steps)
     require = {"sim.overshoot_pct": {"max": 10.0}, "sim.rise_s": {"min": 0.1, "max": 0.4}, "sim.settling_s": False}
     asked = make_requirements({"sim": {"decides": True}, "require": require})
-    found = run_drawn("f", draws, pi().block(), asked, order="sequential", observer=None, attempt=2,
-                      progress=lambda share, _: told.append(share), **more)  # fmt: skip
+    found = run_drawn("f", draws, pi().block(), asked, order="sequential", observer=None,
+                      **{"attempt": 2, **more}, progress=lambda share, _: told.append(share))  # fmt: skip
     return found, told
 
 
@@ -585,5 +585,5 @@ def test_each_kind_of_margin_is_bisected_on_the_draws_that_swing_most(monkeypatc
     facts = found.conditions["axes.gain_margin"]
     assert [item["name"] for item in facts] == [f"draw {k} of f" for k in (5, 4, 3, 1, 2, 3)]
     assert [item["raised"] for item in facts] == ["gain_up"] * 3 + ["gain_down"] * 3
-    # A search sees draws of its own, and no more than it asks for.
-    assert run_with(monkeypatch, [{}] * 5, [[]] * 5, search=True, count=2)[0].count == 2
+    # A search sees draws of its own, which no certificate has.
+    assert run_with(monkeypatch, [{}] * 4, [[]] * 5, attempt=0)[0].count == 4

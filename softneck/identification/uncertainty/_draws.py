@@ -32,8 +32,8 @@ from ..structured._play_draws import PlayDraws
 
 #: Draws of one certificate: none of 59 failing means that 95 % of such plants hold, with 95 % confidence.
 DRAWS = 59
-#: Draws that a search may see, and certificates that a family has draws for.
-SEARCH_DRAWS, ATTEMPTS = 8, 6
+#: Draws that a search may see, as many as those of a certificate, and certificates that a family has draws for.
+SEARCH_DRAWS, ATTEMPTS = 59, 5
 #: Share of held-out samples that the band must cover.
 LEVEL = 0.95
 # Last part of each run, held out from the fit; rows of each run that are used at most [s of a neck's time]: all of
