@@ -67,8 +67,8 @@ _SEARCHED_DRAWS = 4
 # Number of the best candidates that are verified until one holds.
 _MAX_VERIFICATIONS = 2
 # Number of all verifications, if a family has draws for so many.
-_MAX_ATTEMPTS = 6
-# Where a certificate fails: the number of its draws that join the search, of candidates with which it resumes, and its
+_MAX_ATTEMPTS = 5
+# Where draws fail: the number of them that join the search, of candidates with which it resumes, and its
 # share of the budget.
 _MORE_DRAWS, _RESUMED, _RESUMED_SHARE = 3, 6, 0.4
 # Speeds whose default is relaxed, without another search, where the best misses it by no more than this factor.

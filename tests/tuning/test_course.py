@@ -209,7 +209,7 @@ def test_a_tuning_says_how_far_it_is_from_nothing_to_all(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("attempts", [[], [2], [2, 5], [5, 2], [100], [100, 7]])
-def test_there_are_as_many_certificates_as_every_family_has_draws_for_and_at_most_six(attempts: list[int]) -> None:
+def test_there_are_as_many_certificates_as_every_family_has_draws_for_and_at_most_five(attempts: list[int]) -> None:
     families = {str(k): SimpleNamespace(draws=SimpleNamespace(attempts=count)) for k, count in enumerate(attempts)}
     task: Any = SimpleNamespace(linear={"model": object(), "other": SimpleNamespace(draws=None), **families})
-    assert _tune._most_attempts(task) == min([6, *attempts])
+    assert _tune._most_attempts(task) == min([5, *attempts])

@@ -149,7 +149,7 @@ def test_a_result_holds_nothing_that_its_certificate_has_not() -> None:
     values = (None, math.nan, math.inf, 0.5)
     rows = [Verdict(bound("step.load_rms_deg"), value, value == 0.5, {}, "") for value in values]
     best = Candidate("pi", {}, np.zeros(0), "all", {"step.load_rms_deg": 0.5})
-    asked = SimpleNamespace(bounds=[bound("track.circle_rms_deg")])
+    asked = SimpleNamespace(bounds=[bound("track.ahead_rms_deg")])
     found: Any = SimpleNamespace(
         verification=SimpleNamespace(verdicts=rows), best=best, task=SimpleNamespace(asked=asked, own={"p": 1})
     )
@@ -159,8 +159,8 @@ def test_a_result_holds_nothing_that_its_certificate_has_not() -> None:
     assert [row["value"] for row in told["failed"]] == [None] * 4
     # A circle that was not simulated fails where there is a model, and decides nothing where there is none.
     for circle, own, held in ((None, {"p": 1}, False), (None, {}, None), (math.nan, {"p": 1}, False),
-                              (math.inf, {"p": 1}, False), (2.0, {"p": 1}, True), (2.0, {}, True)):  # fmt: skip
-        best.metrics |= {} if circle is None else {"track.circle_rms_deg": circle}
+                              (math.inf, {"p": 1}, False), (1.4, {"p": 1}, True), (1.4, {}, True)):  # fmt: skip
+        best.metrics |= {} if circle is None else {"track.ahead_rms_deg": circle}
         found.task.own = own
         assert _verdict_rows(found)[-1]["holds"] is held
     # Loops of tuning alone that are worse than those of `verify` count; of no number nothing is better.

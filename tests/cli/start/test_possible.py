@@ -26,7 +26,7 @@ from .conftest import facts_of, short_plan
 # Of a linear model alone, whose steps are asked of it.
 WHY = {
     "step.rise_s": "`step.rise_s` <= 0.4 s cannot be: too slow.",
-    "track.circle_rms_deg": "`track.circle_rms_deg` cannot be: late.",
+    "track.ahead_rms_deg": "`track.ahead_rms_deg` cannot be: late.",
 }
 
 
