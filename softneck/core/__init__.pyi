@@ -1,6 +1,7 @@
 from ._archive import read_archive as read_archive
 from ._archive import write_archive as write_archive
 from ._certificate import Certificate as Certificate
+from ._certificate import certifies as certifies
 from ._certificate import check_certificate as check_certificate
 from ._certificate import read_certificate as read_certificate
 from ._certificate import write_certificate as write_certificate

@@ -65,6 +65,11 @@ def required_rows(contents: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [{**row, "metric": sim_name(row["metric"])} if "metric" in row else row for row in found]
 
 
+def certifies(contents: Mapping[str, Any]) -> bool:
+    """Return whether a certificate's JSON values say that it holds, and that some requirement of it does."""
+    return contents.get("holds") is True and any(row.get("holds") is True for row in required_rows(contents))
+
+
 def sim_name(name: Any) -> Any:
     """Return the current name of a metric or table: up to softneck 0.2 `sim.*` was called `neck.*`."""
     return re.sub(r"^neck(?=\.|$)", "sim", name) if isinstance(name, str) else name
@@ -124,7 +129,7 @@ def read_certificate(path: str | Path) -> Certificate:
     return Certificate(
         path=source,
         kind=contents["certificate"],
-        holds=contents.get("holds") is True and bool(required_rows(contents)),
+        holds=certifies(contents),
         files=_files(source, contents.get("files")),
         contents=contents,
     )

@@ -22,6 +22,7 @@ from softneck.core import (
     Progress,
     SettingsError,
     SoftneckError,
+    certifies,
     file_hash,
     load,
     open_zip,
@@ -310,7 +311,7 @@ def project_verdict(project: Project) -> tuple[str, bool | None]:
     decision = decision_values(project)["decision"]
     loops = [result for result in project.loops.values() if result.limits]
     held = sum(result.holds for result in loops)
-    certified = sum(_certifies(content) for content in project.certificates.values())
+    certified = sum(certifies(content) for content in project.certificates.values())
     parts = [f"{held} of {len(loops)} loops keep their limits"] if loops else []
     if project.certificates:
         parts.append(f"{certified} of {len(project.certificates)} certificates hold")
@@ -414,7 +415,7 @@ def _certificates(project: Project) -> Section:
     for name, content in project.certificates.items():
         stale = _changed_files(project.folder, name, content)
         asked = required_rows(content)
-        verdict = "holds" if _certifies(content) else "fails"
+        verdict = "holds" if certifies(content) else "fails"
         rows.append([name, str(content["certificate"]), str(len(asked)), ", ".join(stale) or "none", verdict])
         details += [_requirement(name, row) for row in asked]
     head = ["certificate", "of", "requirements", "files changed since", "verdict"]
@@ -425,11 +426,6 @@ def _certificates(project: Project) -> Section:
             Table(f"Requirements ({of})", ["certificate", "metric", "value", "limit", "verdict"], details, text=2)
         )
     return Section("Verification", tables=tables)
-
-
-def _certifies(content: Mapping[str, Any]) -> bool:
-    """Return whether a certificate has requirements and all of them hold."""
-    return bool(content.get("holds")) and bool(required_rows(content))
 
 
 def _requirement(name: str, row: Mapping[str, Any]) -> list[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from softneck.core import SettingsError, required_rows, to_si
+from softneck.core import SettingsError, certifies, required_rows, to_si
 from softneck.plots import cell
 
 from ._metrics import MARGIN_GROUPS, metric_title
@@ -32,7 +32,7 @@ def certificate_values(file: str, content: Values) -> dict[str, Any]:
     return {"file": file, "of": str(content.get("certificate")), "controller": str(controller),
             "kind": str(content.get("controller_kind", "")), **verdict_values(rows),
             "drives": has_drives(content.get("units", ())),
-            "holds": bool(content.get("holds")) and bool(rows)}  # fmt: skip
+            "holds": certifies(content)}  # fmt: skip
 
 
 def has_drives(units: Sequence[str]) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,6 +12,7 @@ from softneck.core import (
     CheckFailedError,
     FileFormatError,
     OutputFileError,
+    certifies,
     check_certificate,
     file_hash,
     read_certificate,
@@ -139,3 +141,16 @@ def test_a_changed_file_is_named_so_beside_one_of_another_name(tmp_path: Path) -
     one.write_bytes(b"another")
     with pytest.raises(CheckFailedError, match=r"pi\.npz: was changed after it was certified"):
         check_certificate(path, [one, two])
+
+
+@pytest.mark.parametrize("key", ["requirements", "limits"])
+@pytest.mark.parametrize(
+    ("said", "rows", "holds"),
+    [(True, [True], True), (True, [None, True], True), (True, [None, None], False), (True, [], False),
+     (False, [True], False), (1, [True], False), (None, [True], False), (True, [1], False), (True, [False], False)],
+)  # fmt: skip
+def test_a_certificate_certifies_where_it_says_so_and_something_in_it_holds(
+    key: str, said: Any, rows: list[Any], holds: bool
+) -> None:
+    assert certifies({"holds": said, key: [{"metric": "m", "holds": one} for one in rows]}) is holds
+    assert not certifies({"holds": said})

@@ -332,6 +332,18 @@ def test_two_chunks_for_each_worker_are_out_and_one_alone_after_a_death() -> Non
     course._running.clear()
     course._submit_next()
     assert (pool.chunks[-1], list(course._suspects)) == ([50], [51])
+    # After a death one worker is left, with one suspect and nothing beside it; then all of them begin again.
+    course._running.clear()
+    course._restart()
+    assert pool.starts == [1]
+    course._submit_next()
+    assert (pool.chunks[-1], list(course._suspects)) == ([51], [])
+    course._submit_next()
+    assert pool.chunks[-1] == [51]
+    course._running.clear()
+    course._submit_next()
+    assert pool.starts == [1, 3]
+    assert pool.chunks[-6:] == [[k] for k in range(6, 12)]
 
 
 def test_parts_of_one_class_with_other_numbers_are_other_studies(monkeypatch: pytest.MonkeyPatch) -> None:
