@@ -1,6 +1,7 @@
 """Hold what `softneck verify` promises against the truth: what it requires, and what the true (foreign) plant does.
 
 `python benchmarks/promises.py [--necks NECK...] [--kinds KIND...] [--data DATA...] [--workers N] [--fresh | --table]`
+or `--start [--necks NECK...]`
 
 For each neck what docs/howto/payloads.md tells a user to do: the least co-contraction at which the large experiment is
 heard with 1 kg, which recordings and loops then have; a family from recordings of small and large amplitude at 0 and 1
@@ -9,8 +10,8 @@ of Eq. 22 alone, without co-contraction. For each kind of controller with defaul
 the plant that was recorded, at both payloads, the margins by experiment and the steps. A promise is false where a
 requirement holds that the true plant breaks; of what no experiment shows (Ms, disks, mu) the gain margin that it
 implies is asked. Nothing is chosen here: held-out necks have a block of their own.
-`--draws` prints, for a family with draws from Eq. 22 and APRBS at two payloads, each metric by payload and direction:
-the worst of 59 draws, which is certified, beside the plant itself.
+`--start` prints what `softneck start` certifies of one recording of `mixed` around 1.5 rad, beside the loop that it
+delivers on the plant itself.
 Families and results are kept in `build/promises`: a run that was stopped goes on where it was. Use --fresh after a
 change, and --table to print what is there.
 """
@@ -18,11 +19,14 @@ change, and --table to print what is there.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
+import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import astuple, dataclass, replace
 from multiprocessing import get_context
@@ -40,6 +44,7 @@ from softneck.loop import BlockPart
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import Block
 from softneck.signals import Excitation, Recording, SetPointLimits, concatenate, multisine_experiments, prepare, signal
+from softneck.signals.recording._files import write_recording
 from softneck.verification import make_requirements, verify
 from softneck.verification._experiments import LoopUnderTest, crossing_values, crossings
 from softneck.verification._neck_loops import SimulationModel, run_loops
@@ -360,63 +365,64 @@ def _margins(rows: dict[Job, dict[str, Any]]) -> None:
         print(f"| {job.neck} {job.kind} {job.speed} | {' | '.join(cells)} |")
 
 
-# Of `--draws`: recordings and loops, and settings of a controller that is fast enough to need its certificate.
-DRAWN_PAYLOADS, DRAWN_COCONTRACTION, DRAWN_FAST = (0.0, 0.5), 0.6, {"lead_limit": 0.8, "reference_time": 0.12}
-DRAWN_SIM = {"payloads_kg": list(DRAWN_PAYLOADS), "orientations_deg": [0.0, 45.0, 90.0]}
-DRAWN_METRICS = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg")
+# Of `--start`: the co-contraction of its recording [rad], the steps of the truth, and what is compared.
+START_COCONTRACTION = 1.5
+START_SIM = {"payloads_kg": [0.0], "orientations_deg": [45.0 * k for k in range(8)], "duration_s": 6.0}
+STEPS = ("sim.rise_s", "sim.overshoot_pct", "sim.settling_s", "sim.steady_rms_deg")
 
 
-def drawn_family(neck: str) -> Any:
-    """Return a family with draws of what a user records first; made once and kept."""
-    file = OUT / f"{neck}_drawn.npz"
-    if not file.exists():
-        signals = [signal("eq22", duration=60.0), signal("aprbs", duration=60.0)]
-        parts = [recorded(neck, each, n, kg, DRAWN_COCONTRACTION)
-                 for n, (each, kg) in enumerate((each, kg) for each in signals for kg in DRAWN_PAYLOADS)]  # fmt: skip
-        file.parent.mkdir(parents=True, exist_ok=True)
-        softneck.family(parts, draws=59).save(file)
-    return softneck.load(file)
+def started(neck: str) -> Path:
+    """Return the project that `softneck start` makes of one recording of a neck; made once and kept."""
+    folder, log = OUT / f"{neck}_start", OUT / f"{neck}_start.csv"
+    if not (folder / "start.json").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_recording(log, recorded(neck, signal("mixed", seed=1), 1, 0.0, START_COCONTRACTION), force=True)
+        command = [sys.executable, "-m", "softneck", "start", str(log), "-o", str(folder), "--yes"]
+        subprocess.run(command, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return folder
 
 
-def drawn_table(neck: str, kind: str, settings: Mapping[str, Any]) -> tuple[int, int]:
-    """Print each metric of a controller by payload and direction; return how many are true, of how many."""
-    family = drawn_family(neck)
-    controller = softneck.design_controller(kind, family, least_cocontraction=DRAWN_COCONTRACTION, **settings)
-    asked = make_requirements({"sampling": FEW["sampling"], "sim": DRAWN_SIM})
-    found = verify(controller, {"family": family}, asked)
-    [part] = found.evidence.drawn
+def delivered(neck: str, folder: Path) -> dict[str, float]:
+    """Return metric -> the worst value of the loop that a project delivers, on the neck itself."""
+    controller = softneck.load(folder / "tune/best.npz")
+    told = tomllib.loads((folder / "tune/loop.toml").read_text(encoding="utf-8"))
+    observer = softneck.load(folder / "tune/observer.npz").block() if "observer" in told else None
+    order = str(getattr(controller, "order", "sequential"))
     own = SimulationModel(
         name=neck, payload="inputs", make=lambda seed, _: Sensed(block_of(neck, noise=True, seed=seed)),
         quiet=lambda _: Sensed(block_of(neck, noise=False)),
     )  # fmt: skip
-    runs = run_loops(controller.block(), asked, order="sequential", observer=None, seed=0,
+    runs = run_loops(controller.block(), make_requirements({"sim": START_SIM}), order=order, observer=observer, seed=0,
                      progress=softneck.core.silent, own=[own])  # fmt: skip
-    loops = [
-        LoopUnderTest(name=neck, plant=lambda: BlockPart(block_of(neck, noise=False)), controller=controller.block(),
-                      constants={"plant_inputs": {"payload": kg}}) for kg in DRAWN_PAYLOADS
-    ]  # fmt: skip
-    true_margins = crossing_values(crossings(loops, overall=True))
-    kept = total = 0
-    print(f"\n{neck}, {kind}: {'holds' if found.holds else 'does not hold'} "
-          f"({', '.join(v.requirement.metric for v in found.failed) or part.statement()}); {found.wall_time:.0f} s\n\n"
-          "| metric | condition | certified | true | true within |\n|---|---|---|---|---|")  # fmt: skip
-    for run in runs:
-        condition = run.name.partition(", ")[2]
-        for name in DRAWN_METRICS:
-            every = zip(part.values[f"sim.{name}"], part.conditions[f"sim.{name}"], strict=True)
-            rows = [value for value, told in every if told["name"].partition(", ")[2] == condition]
-            worst, true = max(rows), run.metrics[name]
-            kept, total = kept + (true <= ROUNDING * worst), total + 1
-            print(
-                f"| {name} | {condition} | {worst:.3g} | {true:.3g} | {'yes' if true <= ROUNDING * worst else 'no'} |"
-            )
-    for name in MARGINS:
-        least, true = float(part.values[name].min()), float(true_margins[name][0].min())
-        kept, total = kept + (ROUNDING * true >= least), total + 1
-        print(
-            f"| {name} | all | {least:.3g} | {true:.3g} | {'yes' if ROUNDING * true >= least else 'no'} |", flush=True
-        )
-    return kept, total
+    loop = LoopUnderTest(name=neck, plant=lambda: BlockPart(block_of(neck, noise=False)), controller=controller.block(),
+                         observer=observer, order=order, constants={"plant_inputs": {"payload": 0.0}})  # fmt: skip
+    margins = crossing_values(crossings([loop], overall=True))
+    steps = {name: max(run.metrics[name.partition(".")[2]] for run in runs) for name in STEPS}
+    return steps | {name: float(margins[name][0].min()) for name in MARGINS}
+
+
+def start_table(necks: Sequence[str]) -> None:
+    """Print certified and true values of what `softneck start` delivers, and how many are true."""
+    names = (*STEPS, *MARGINS)
+    head = " | ".join(f"{name}: certified, true" for name in names)
+    print(f"| neck | loosened | {head} |\n|{'---|' * (2 + len(names))}")
+    within, below, farthest, total = 0, 0, 0.0, 0
+    for neck in necks:
+        folder = started(neck)
+        file, true = folder / "tune/best.certificate.json", delivered(neck, folder)
+        told = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {"requirements": [], "loosened": {}}
+        rows = {row["metric"]: row for row in told["requirements"]}
+        eased = ", ".join(told["loosened"]) or ("none" if rows else "no certificate")
+        cells = [f"{_number(rows[n]['value']):.3g}, {true[n]:.3g}" if n in rows else f"-, {true[n]:.3g}" for n in names]
+        print(f"| `{neck}` | {eased} | {' | '.join(cells)} |", flush=True)
+        for name in (name for name in names if name in rows):
+            value, limit = _number(rows[name]["value"]), _number(rows[name]["limit"])
+            sign = -1.0 if name in MARGINS else 1.0
+            within += sign * true[name] <= sign * limit
+            below += sign * true[name] <= sign * value
+            farthest, total = max(farthest, sign * (true[name] - value) / limit), total + 1
+    print(f"\ntrue within the certified limit: {within} of {total}; within the certified value: {below} of {total}, "
+          f"the farthest by {100.0 * farthest:.0f} % of its limit")  # fmt: skip
 
 
 def main() -> None:
@@ -428,13 +434,11 @@ def main() -> None:
     parser.add_argument("--speeds", nargs="*", default=SPEEDS, choices=SPEEDS)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--fresh", action="store_true", help="Forget what is kept.")
-    parser.add_argument("--draws", action="store_true", help="Print metrics by payload and direction, from draws.")
+    parser.add_argument("--start", action="store_true", help="Print what `softneck start` certifies, beside the truth.")
     parser.add_argument("--table", action="store_true", help="Compute nothing; print what is kept.")
     asked = parser.parse_args()
-    if asked.draws:
-        sums = np.array([drawn_table(neck, kind, settings) for neck in asked.necks for kind in asked.kinds
-                         for settings in ({}, DRAWN_FAST)])  # fmt: skip
-        print(f"\ntrue: {sums[:, 0].sum()} of {sums[:, 1].sum()}")
+    if asked.start:
+        start_table(asked.necks)
         return
     kept = OUT / "results.jsonl"
     kept.parent.mkdir(parents=True, exist_ok=True)
