@@ -312,6 +312,7 @@ class _Race:
         self.folds = left_out or [Fold(train, ())]
         self.tried: dict[str, KindTrial] = {}
         self.short: dict[str, Model] = {}
+        self._whole: dict[str, Model] = {}
         # Baselines of the rows held out, which are the same for all; of the exam its motions, simulations and weights.
         self._known: dict = {}
         self._motions: list[Recording] = []
@@ -429,11 +430,8 @@ class _Race:
         try:
             if one.model is None:
                 raise DataError(one.failure)
-            model = _settings(kind, self.seed, {}).fit(self.train)
+            model = self._fitted(kind)
             if self.folds[0].judged:
-                if kind == "greybox":
-                    again = as_found(_settings(kind, self.seed, _SCREENED[kind]), model)
-                    self.short[kind] = again.fit(self.folds[0].train)
                 model = calibrate_validity(model, self.short[kind], *unseen_rows(self.folds[0]))
             judged = self._validate(kind, model)
             fits, error = all_rows(HOLD_OUT, self.hold_out).fits(model)
@@ -457,8 +455,16 @@ class _Race:
         alike = [one for one in ranking if one.fit > best.fit - ALIKE]
         return min(alike, key=lambda one: (one.numbers, _SIMPLE_FIRST.index(one.kind)))
 
+    def _fitted(self, kind: str) -> Model:
+        """Return the model of all rows to train on, which is trained once."""
+        if kind not in self._whole:
+            self._whole[kind] = _settings(kind, self.seed, {}).fit(self.train)
+        return self._whole[kind]
+
     def _short(self, kind: str, train: Recording) -> Model:
         short = dict(_SCREENED.get(kind, {}))
+        if kind == "greybox":  # its dead time and parts are properties of the robot: known once
+            return as_found(_settings(kind, self.seed, short), self._fitted(kind)).fit(train)
         if kind == "nlsm":
             short["epsilon"] = _EPSILON_SIGMAS * float(noise_si(train).max())
         return _settings(kind, self.seed, short).fit(train)

@@ -81,7 +81,7 @@ class _Trial:
             Y = np.concatenate([Y for _, Y in problem.simulate(self.found.x, self.found.delay)])
             y = np.where(judged.rows[:, None], judged.recording.outputs, np.nan)
             fits = [nrmse_fit(*pair) for pair in zip(y.T, Y.T, strict=True)]
-            worst = min(worst, *(fit if np.isfinite(Y).all() else -np.inf for fit in fits if fit == fit))
+            worst = min([worst, *(fit if np.isfinite(Y).all() else -np.inf for fit in fits if fit == fit)])
         return worst
 
 

@@ -420,6 +420,8 @@ def test_a_short_training_is_scored_on_each_part_and_a_failure_costs_its_own_tim
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     race, fitted = racing(monkeypatch, judged=2, fails="oe")
+    known: list[Any] = []
+    monkeypatch.setattr(_auto, "as_found", lambda settings, model: known.append(model) or settings)
     begin = time.perf_counter()
     for kind in ("rls", "oe", "nlsm", "greybox"):
         race.screen(kind)
@@ -429,12 +431,17 @@ def test_a_short_training_is_scored_on_each_part_and_a_failure_costs_its_own_tim
     assert (one.model, one.whole, one.failure, race.short["rls"]) == ("rls of 800", False, "", "rls of 800")
     failed = race.tried["oe"]
     assert (failed.model, failed.failure, failed.fit) == (None, "it saturates", float("-inf"))
+    # A grey box has the parts and the dead time that all rows have, which are trained on once.
+    sizes = {"rls": [800], "oe": [800], "nlsm": [800], "greybox": [900, 800]}
     assert [(kind, seed, len(rows)) for kind, seed, _, rows in fitted] == [
-        (kind, 5, 800) for kind in ("rls", "oe", "nlsm", "greybox")
+        (kind, 5, number) for kind, numbers in sizes.items() for number in numbers
     ]
+    assert known == ["greybox of 900"]
     # A set's epsilon is eight deviations of the louder output's noise; a grey box is of the cheaper settings.
     assert fitted[2][2] == {"output_weight": 5.0, "epsilon": pytest.approx(8.0 * 0.2)}
-    assert fitted[3][2] == _auto.SHORT["greybox"]
+    assert (fitted[3][2], fitted[4][2]) == ({}, _auto.SHORT["greybox"])
+    race.whole("greybox")
+    assert len(fitted) == 5
     assert 0.0 <= sum(one.seconds for one in race.tried.values()) <= time.perf_counter() - begin
 
 
@@ -444,18 +451,13 @@ def test_a_whole_training_is_judged_again_and_held_to_what_its_short_one_kept(
     judged: int, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     race, fitted = racing(monkeypatch, judged=judged)
-    found: list[Any] = []
-    monkeypatch.setattr(_auto, "as_found", lambda settings, model: found.append(model) or settings)
     race.short[kind] = "short"  # pyright: ignore[reportArgumentType]
     race.tried[kind] = ran(kind, errors={"a": 1.5}, outputs={"a": FITS})
     begin = time.perf_counter()
     race.whole(kind)
-    one, again = race.tried[kind], kind == "greybox" and judged == 1
-    short = "greybox of 800" if again else "short"
-    assert (one.model, one.whole) == (f"{kind} of 900" + f", held by {short}" * judged, True)
-    # A grey box takes over the form that was found, in its short settings.
-    assert found == [f"{kind} of 900"] * again
-    assert [(told, len(rows)) for _, _, told, rows in fitted] == [({}, 900)] + [(_auto.SHORT["greybox"], 800)] * again
+    one = race.tried[kind]
+    assert (one.model, one.whole) == (f"{kind} of 900" + ", held by short" * judged, True)
+    assert [(told, len(rows)) for _, _, told, rows in fitted] == [({}, 900)]
     second = {_auto.SECOND: {"pitch": 10.0}} if judged else {}
     assert one.outputs == {"a": FITS, HOLD_OUT: {"pitch": 90.0, "roll": 50.0}, **second}
     assert one.errors == {"a": 1.5, HOLD_OUT: 3.0}

@@ -10,8 +10,12 @@ import pytest
 
 from softneck.core import FileFormatError, SettingsError, load
 from softneck.identification import GreyBox, Model
+from softneck.identification.models._fitting import ScaledData
+from softneck.identification.models._left_out import Judged
 from softneck.identification.structured._greybox import PARAMETERS
+from softneck.identification.structured._output_error import FitProblem, Found
 from softneck.identification.structured._parameters import BODY_PARAMETERS, RIGID
+from softneck.identification.structured._parts import _Trial
 from softneck.runtime import load_functions
 from softneck.signals import SET_POINTS, Recording, signal
 from softneck.signals.recording._channels import MOTOR_POSITIONS
@@ -151,6 +155,21 @@ def test_the_creep_behind_its_own_equations_is_found(creeping: Model) -> None:
     assert "coupling" not in found
     assert "time constant" in creeping.findings["found"]
     assert "time constant" in creeping.summary()
+
+
+def test_rows_left_out_that_nobody_measured_say_nothing_of_parts() -> None:
+    data = recording(RIGID, "eq22", 1, 200)
+    problem = FitProblem.of(ScaledData.of(data, amplitudes=False))
+    x = np.array([number.encode(number.guess) for number in problem.numbers])
+    nothing = np.full(len(data), np.nan)
+    measured, blank = (
+        Judged("part", one, np.ones(len(data), dtype=bool))
+        for one in (data, data.with_channels(pitch=nothing, roll=nothing))
+    )
+    assert _Trial(Found(problem, x, 2, 1.0), [(blank, problem)]).fit() == np.inf
+    fits = [_Trial(Found(problem, x, 2, 1.0), [(one, problem) for one in judged]).fit()
+            for judged in ([measured], [blank, measured])]  # fmt: skip
+    assert fits[0] == fits[1] < 100.0
 
 
 @pytest.mark.slow
