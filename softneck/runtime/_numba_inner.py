@@ -7,7 +7,7 @@ text is optimised with the function that Python calls.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from typing import Any, Literal
@@ -30,6 +30,8 @@ def pipelines() -> tuple[Any, Any] | None:
     from numba.core.environment import lookup_environment
     from numba.core.typed_passes import NativeLowering
 
+    lower_class = borrowing_lower()
+
     class LinkedLibrary(JITCodeLibrary):
         def finalize(self) -> None:
             for library in dict.fromkeys(self._linking_libraries):
@@ -41,6 +43,10 @@ def pipelines() -> tuple[Any, Any] | None:
     @register_pass(mutates_CFG=True, analysis_only=False)
     class InnerLowering(NativeLowering):
         _name = "inner_lowering"
+
+        @property
+        def lowering_class(self) -> Any:
+            return lower_class
 
         def run_pass(self, state: Any) -> Literal[True]:
             state.library = LinkedLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
@@ -59,6 +65,10 @@ def pipelines() -> tuple[Any, Any] | None:
     @register_pass(mutates_CFG=True, analysis_only=False)
     class OuterLowering(NativeLowering):
         _name = "outer_lowering"
+
+        @property
+        def lowering_class(self) -> Any:
+            return lower_class
 
         def run_pass(self, state: Any) -> Literal[True]:
             super().run_pass(state)
@@ -84,6 +94,101 @@ def pipelines() -> tuple[Any, Any] | None:
         return Compiler
 
     return compiler(OuterLowering), compiler(InnerLowering)
+
+
+def borrowing_lower() -> Any:
+    """Return numba's lowering, which counts no references to arguments, items of tuples and views of arrays of them.
+
+    The caller holds these as long as a function runs. To count them at each call of an inner function, for each of 17
+    arrays of a controller, took as long as its equations.
+    """
+    from numba.core import ir, types
+    from numba.core.lowering import Lower
+
+    class BorrowingLower(Lower):
+        _borrowed: frozenset[str] = frozenset()
+        _uncounted = False
+
+        def lower(self) -> None:
+            self._borrowed = _borrowed_variables(self.func_ir, self.typeof)
+            super().lower()
+
+        def lower_assign(self, ty: Any, inst: Any) -> Any:
+            value, borrowed = inst.value, inst.target.name in self._borrowed
+            if not borrowed or not isinstance(value, ir.Expr):
+                with self._counting(not borrowed):
+                    return super().lower_assign(ty, inst)
+            whole: Any = self.typeof(value.value.name)
+            if (
+                isinstance(whole, types.Tuple | types.UniTuple)
+                and isinstance(value.index, int)
+                and whole.types[value.index] == ty
+            ):
+                return self.builder.extract_value(self.loadvar(value.value.name), value.index % len(whole))
+            made = super().lower_assign(ty, inst)
+            self.decref(ty, made)  # takes back what was counted a line before: LLVM removes both
+            return made
+
+        def storevar(self, value: Any, name: str, argidx: int | None = None) -> None:
+            with self._counting(name not in self._borrowed):
+                super().storevar(value, name, argidx)
+
+        def delvar(self, name: str) -> None:
+            with self._counting(name not in self._borrowed):
+                super().delvar(name)
+
+        def incref(self, typ: Any, val: Any) -> None:
+            if not self._uncounted:
+                super().incref(typ, val)
+
+        def decref(self, typ: Any, val: Any) -> None:
+            if not self._uncounted:
+                super().decref(typ, val)
+
+        @contextmanager
+        def _counting(self, counted: bool) -> Iterator[None]:
+            self._uncounted = not counted
+            try:
+                yield
+            finally:
+                self._uncounted = False
+
+    return BorrowingLower
+
+
+def _borrowed_variables(function: Any, type_of: Callable[[str], Any]) -> frozenset[str]:
+    """Return the variables of numba's `function` that are always an argument, a part of one, or a view of a part."""
+    from numba.core import ir, types
+
+    def source(value: Any, target: str) -> str | None:
+        if isinstance(value, ir.Var):
+            return value.name
+        if not isinstance(value, ir.Expr) or value.op not in ("static_getitem", "getitem"):
+            return None
+        whole, fixed = type_of(value.value.name), value.op == "static_getitem"
+        if isinstance(whole, types.BaseTuple):
+            return value.value.name if fixed else None
+        if not isinstance(whole, types.Array) or not isinstance(type_of(target), types.Array):
+            return None
+        index = value.index_var if fixed else value.index
+        places: Any = None if index is None else type_of(index.name)
+        places = places.types if isinstance(places, types.Tuple | types.UniTuple) else [places]
+        # An array of places makes a copy, which nobody else holds.
+        view = all(isinstance(place, types.Integer | types.SliceType) for place in places)
+        return value.value.name if view else None
+
+    assigned: dict[str, list[Any]] = {}
+    for block in function.blocks.values():
+        for one in block.find_insts(ir.Assign):
+            assigned.setdefault(one.target.name, []).append(one.value)
+    once = {name: values[0] for name, values in assigned.items() if len(values) == 1}
+    found: set[str] = set()
+    while more := {
+        name for name, value in once.items()
+        if name not in found and (isinstance(value, ir.Arg) or source(value, name) in found)
+    }:  # fmt: skip
+        found |= more
+    return frozenset(found)
 
 
 @contextmanager

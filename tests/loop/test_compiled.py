@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import control
 import numba
+import numpy as np
 import pytest
 from numba.core.types import Function
 from numba.core.types.functions import BaseFunction
@@ -195,3 +197,71 @@ def test_numba_resolves_each_call_once_for_our_functions_and_as_ever_for_others(
     count = len(resolved)
     assert numba.njit(lambda x, y: x * y * x * y)(2.0, 3.0) == 36.0
     assert len(resolved) >= count + 3
+
+
+_BORROWING = """
+import numpy as np
+
+def rest(p, k):
+    return p[1][k:]
+
+def scaled(p, x):
+    x = x * p[0][0, 1]
+    return x
+
+def light(p, x, k):
+    y = x[k:]
+    return p[0][k] @ y[:2] if k > 9 else p[0][k, 1] * y[0] + p[1][1:][k]
+
+def work(p, x, n):
+    total = 0.0
+    y = x
+    for k in range(n):
+        z = rest(p, k % 2)
+        y = x[1:] if k % 3 == 0 else scaled(p, z)
+        picked = p[0][np.array([1, 0])]
+        total += light(p, y, 0) + z[0] + picked[0, 0] + y[-1]
+        y[0] = total * 1e-3
+    return total
+
+def quick(p, x, k):
+    return light(p, x, k)
+"""
+
+
+def test_compiled_functions_free_what_they_make_and_hold_what_they_return(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """References to arguments are not counted: those to all else are, and a view that is returned has its own."""
+    from numba.core.runtime import _nrt_python  # pyright: ignore[reportAttributeAccessIssue]
+    from numba.core.runtime.nrt import rtsys
+
+    monkeypatch.setattr(_compile, "_cache_folder", lambda: tmp_path)
+    made, plain = (_compile._import_text(_BORROWING, compiled=True) for _ in range(2))
+    _compile._compile(made, ("work", "rest", "quick"))
+
+    def given() -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+        return (np.arange(4.0).reshape(2, 2), np.arange(5.0, 9.0)), np.arange(1.0, 5.0)
+
+    (p, x), (q, u) = given(), given()
+    expected = plain.work(q, u, 50)
+    counts = [sys.getrefcount(item) for item in (*p, x)]
+    _nrt_python.memsys_enable_stats()
+    before = rtsys.get_allocation_stats()
+    # Products with BLAS are of two numbers: their sum has one order.
+    assert made.work(p, x, 50) == expected
+    assert x.tobytes() == u.tobytes()
+    after = rtsys.get_allocation_stats()
+    _nrt_python.memsys_disable_stats()
+    assert after.mi_alloc - before.mi_alloc == after.mi_free - before.mi_free > 50
+    assert [sys.getrefcount(item) for item in (*p, x)] == counts
+    alone = sys.getrefcount(p[1])
+    view = made.rest(p, 1)
+    assert sys.getrefcount(p[1]) > alone
+    del p
+    assert view.tolist() == [6.0, 7.0, 8.0]
+    (p, x) = given()
+    assert made.quick(p, x, 0) == plain.quick(p, x, 0)
+    if _numba_inner.pipelines() is not None:  # with the numba that was tested nothing is counted at all
+        text = made.quick.inspect_llvm(made.quick.signatures[0])
+        assert "call void @NRT_incref" not in text.split("define ")[1]
