@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import tomllib
 from concurrent.futures import BrokenExecutor, CancelledError, Future
 from dataclasses import replace
@@ -501,3 +502,28 @@ def test_the_worst_runs_are_loop_files_that_start_where_the_study_does(inner: di
     with pytest.raises(SettingsError, match="parts that are not files"):
         write_worst(study, runs, tmp_path)
     assert not _store.has_objects({"plant": [{"x": {"file": OBJECT}}], "y": OBJECT})
+
+
+def test_a_scheduler_is_asked_for_ten_seconds_and_is_nobody_elses_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    there = SimpleNamespace(Client=Mock(return_value="client"))
+    monkeypatch.setattr(_run_study, "require_package", lambda _: None)
+    monkeypatch.setitem(sys.modules, "distributed", there)
+    assert _run_study._client("tcp://there") == "client"
+    there.Client.assert_called_once_with("tcp://there", timeout=10, set_as_default=False)
+    for error in (OSError, TimeoutError, ValueError, TypeError):
+        there.Client.side_effect = error("no")
+        with pytest.raises(SettingsError, match=f"no Dask scheduler answers at tcp://there .{error.__name__}"):
+            _run_study._client("tcp://there")
+
+
+@pytest.mark.parametrize("loop", [5, None, ["loop.toml"], object()])
+def test_a_loop_that_is_none_and_a_file_that_is_not_there_are_refused(loop: Any, tmp_path: Path) -> None:
+    vary = {"duration_s": [1.0, 2.0]}
+    with pytest.raises(SettingsError, match="`loop` must be a loop file or a table"):
+        make_study(loop, vary=vary)
+    with pytest.raises(FileFormatError, match=r"there is no loop file .*none\.toml"):
+        make_study(tmp_path / "none.toml", vary=vary)
+    with pytest.raises(SettingsError, match="`loop` is missing"):
+        _study._from_table(tmp_path / "study.toml", {"runs": 2})
+    with pytest.raises(SettingsError, match="`vary` must be a table"):
+        _study._from_table(tmp_path / "study.toml", {"loop": "a", "vary": 3})
