@@ -127,12 +127,12 @@ def test_draws_that_do_not_fit_their_model_are_refused(made: Callable[..., Draws
         Draws.from_archive(header, arrays)
 
 
-@pytest.mark.parametrize(("rows", "count", "fits"), [(10, 3, False), (11, 3, True), (11, 4, False), (11, 0, False)])
+@pytest.mark.parametrize(("more", "count", "fits"), [(2, 3, False), (3, 3, True), (3, 4, False), (3, 0, False)])
 def test_a_file_has_the_draws_of_a_search_and_of_one_certificate(
-    made: Callable[..., Draws], rows: int, count: int, fits: bool
+    made: Callable[..., Draws], more: int, count: int, fits: bool
 ) -> None:
     header, arrays = made().to_archive()
-    arrays["drawn_weights"] = arrays["drawn_weights"][:rows]
+    arrays["drawn_weights"] = arrays["drawn_weights"][: _draws.SEARCH_DRAWS + more]
     if fits:
         assert Draws.from_archive({**header, "count": count}, arrays).attempts == 1
     else:
