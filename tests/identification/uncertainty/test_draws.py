@@ -494,3 +494,16 @@ def test_the_best_of_all_models_and_factors_is_the_one_of_the_least_mean_score(
     monkeypatch.setattr(_draws._Motions, "scores", lambda *_: np.array(next(told)))
     found = make_draws(recordings, count=2)
     assert (found.model, found.factor) == (sources[chosen].model, factor)
+
+
+def test_a_disturbance_goes_by_the_motion_of_the_middle_draw_and_the_first_certificate_is_the_default(
+    made: Callable[..., Draws],
+) -> None:
+    middle = np.zeros((10, 2))
+    middle[5:] = 1.0  # it moves once
+    Y, share = np.stack([middle + 9.0 * np.arange(10)[:, None], middle, middle - 9.0]), np.array([0.2, 0.4])
+    low, high = segments(middle).band(Y, share, 0.5)
+    expected = np.where(np.arange(10)[:, None] < 5, 0.0, 1.96 * share * 0.5 ** (np.arange(10)[:, None] - 5.0))
+    np.testing.assert_allclose(high - Y.max(axis=0), expected)
+    np.testing.assert_allclose(Y.min(axis=0) - low, expected)
+    assert bits(made().for_certificate()) == bits(made().for_certificate(1))
