@@ -138,7 +138,7 @@ def test_a_budget_too_small_is_said_and_its_search_goes_on_with_what_it_wrote(
     told = capsys.readouterr()
     limits = {row["metric"]: row["limit"] for row in json.loads(told.out)["requirements"]}
     assert limits["sim.overshoot_pct"] == 60.0 - 1.6  # less the reserve of the defaults, once
-    assert "track.circle_rms_deg, track.ahead_rms_deg not looked at" in told.err
+    assert "track.ahead_rms_deg, track.circle_rms_deg not looked at" in told.err
 
 
 @pytest.mark.slow
