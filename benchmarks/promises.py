@@ -416,7 +416,8 @@ def start_table(necks: Sequence[str]) -> None:
         cells = [f"{_number(rows[n]['value']):.3g}, {true[n]:.3g}" if n in rows else f"-, {true[n]:.3g}" for n in names]
         print(f"| `{neck}` | {eased} | {' | '.join(cells)} |", flush=True)
         for name in (name for name in names if name in rows):
-            value, limit = _number(rows[name]["value"]), _number(rows[name]["limit"])
+            limit, value = _number(rows[name]["limit"]), rows[name]["value"]
+            value = math.inf if value is None and name in MARGINS else _number(value)  # no end of it was found
             sign = -1.0 if name in MARGINS else 1.0
             within += sign * true[name] <= sign * limit
             below += sign * true[name] <= sign * value

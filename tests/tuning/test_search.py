@@ -467,7 +467,7 @@ def test_draws_that_a_search_sees_are_in_no_certificate_and_decide_for_linear_ma
              "sim": {"payloads_kg": [0.0], "orientations_deg": [0.0], "size_deg": 10.0},
              "require": {"sim.rise_s": {"max": 0.9}}}  # fmt: skip
     found = tune({"neck": replace(family(), draws=draws)}, asked, kinds=("pi",), budget=4, workers=0)
-    assert found.task.drawn [:4] == tuple(f"neck, draw {k + 1}" for k in range(4))
+    assert found.task.drawn[:4] == tuple(f"neck, draw {k + 1}" for k in range(4))
     assert "axes.sensitivity" not in {bound.metric for bound in found.task.bounds}
     [part] = found.verification.evidence.drawn
     assert part.count == draws.count

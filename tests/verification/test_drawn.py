@@ -86,7 +86,8 @@ def test_one_draw_that_fails_fails_the_certificate_and_another_attempt_has_other
 
 @pytest.mark.slow
 def test_the_margin_of_equal_draws_is_that_by_the_scan_of_one(drawn: Draws) -> None:
-    same = replace(drawn, arrays={"weights": np.repeat(drawn.arrays["weights"][:1], _draws.SEARCH_DRAWS + 2 * COUNT, axis=0)})
+    count = _draws.SEARCH_DRAWS + 2 * COUNT
+    same = replace(drawn, arrays={"weights": np.repeat(drawn.arrays["weights"][:1], count, axis=0)})
     asked = make_requirements(ASKED)
     [part] = verify(pi(), {"family": with_draws(same)}, asked).evidence.drawn
     one = make_simulation_model(same.for_search(1)[0], "one", asked.robot)
