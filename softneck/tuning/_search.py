@@ -208,19 +208,19 @@ class Search:
         for level in levels[1:]:
             self._judge(list(starts.values()), level, finals)
         if self.task.drawn:
-            starts = self._judge_calmer(starts, levels, finals)
+            starts = self._judge_detuned(starts, levels, finals)
         self.dropped |= {kind: item.error for kind, item in starts.items() if item.error}
         for number, space in enumerate(self.spaces):
             if not np.array_equal(starts[space.kind].x, space.start):
                 optimisers[space.kind] = _optimiser(space, self.task.seed, number, starts[space.kind].x)
         return self._drop_kinds([space for space in self.spaces if space.kind not in self.dropped])
 
-    def _judge_calmer(self, starts: dict[str, Candidate], levels: Sequence[str], finals: int) -> dict[str, Candidate]:
-        """Return the better of each start and of a slower one: at its limits of margins a kind overshoots."""
-        calmer = {space.kind: self._candidate(space, space.calmer(starts[space.kind].x)) for space in self.spaces}
+    def _judge_detuned(self, starts: dict[str, Candidate], levels: Sequence[str], finals: int) -> dict[str, Candidate]:
+        """Return the better of each start and of a detuned one: with the least allowed margins a kind overshoots."""
+        detuned = {space.kind: self._candidate(space, space.detuned(starts[space.kind].x)) for space in self.spaces}
         for level in levels:
-            self._judge(list(calmer.values()), level, finals)
-        return {kind: min(starts[kind], calmer[kind], key=self._rank) for kind in starts}
+            self._judge(list(detuned.values()), level, finals)
+        return {kind: min(starts[kind], detuned[kind], key=self._rank) for kind in starts}
 
     def _move_starts(self, starts: dict[str, Candidate], reserved: int) -> dict[str, Candidate]:
         """Return the starts with the largest bound on Ms that the margins allow, by bisection."""

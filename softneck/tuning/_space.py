@@ -67,8 +67,8 @@ _RISE_MARGIN = 1.03
 _LEAD_LIMIT_RAD = 0.6
 # The second number of `reference_time`.
 _LEAD = Dimension("lead", 0.2, 2.5, 1.0)
-# How far a calmer design is from another, as shares of the ranges.
-_CALMER = {"max_sensitivity": 0.1, _LEAD.name: 0.28}
+# How far a detuned design is from another, as shares of the ranges.
+_DETUNED = {"max_sensitivity": 0.1, _LEAD.name: 0.28}
 # Kinds for which `lead_limit` is searched.
 _PREDICTIVE_KINDS = ("mpc", "nmpc")
 
@@ -95,9 +95,9 @@ class Space:
         names = [item.name for item in self.dimensions]
         return names.index("max_sensitivity") if "max_sensitivity" in names else None
 
-    def calmer(self, x: Vector) -> Vector:
+    def detuned(self, x: Vector) -> Vector:
         """Return a point with smaller peaks of S and less lead of the reference."""
-        away = np.array([_CALMER.get(item.name, 0.0) for item in self.dimensions])
+        away = np.array([_DETUNED.get(item.name, 0.0) for item in self.dimensions])
         return np.clip(x - away, 0.0, 1.0)
 
     def settings(self, x: Vector) -> dict[str, Any]:

@@ -152,7 +152,7 @@ def tune(
             objects or files.
         requirements: beside the defaults: a file, a table like one, or flat as in `{"overshoot_pct": 5}`.
         kinds: of controllers, also as "pi,mpc"; default `KINDS_SEARCHED`, beside recordings without `UNCERTIFIED`.
-        budget: number of judgements of candidates; 40 % more where draws of a family fail the certificate.
+        budget: number of judgements of candidates; 40 % more where draws of a family fail.
         observer: of the loop; default a Kalman filter over the nominal plant.
         seed: of the search and of the noise in its loops.
         workers: processes; default one per core, 0 for this process.
@@ -265,19 +265,20 @@ def _certify_search(
 ) -> tuple[Search, _Certified, int]:
     """Return a search that ended, its certified best and the number of verifications.
 
-    Where draws of the certificate fail, the worst of them join the plants and the search resumes from its best.
+    Where draws of the search or of its certificate fail, the worst of them join the plants and the search resumes.
     """
     task, best = search.task, search.sort_candidates()[:1]
     failed = _failed_in_search(task, best[0]) if best else []
     drawn = _drawn_in_search(task, best[0]) if failed else []
-    certified, tried = (None, 0) if failed else _verify_best(search, 0, files, progress)
+    failing = _failing_draws(drawn, failed)
+    certified, tried = (None, 0) if failing else _verify_best(search, 0, files, progress)
     if certified is not None:
         verification = certified.verification
         if not (verification.holds or _is_near(certified.item, verification.failed, task)):
-            failed, drawn = verification.failed, verification.evidence.drawn
-        if not drawn or tried >= _most_attempts(task):
+            failed = verification.failed
+            failing = _failing_draws(verification.evidence.drawn, failed)
+        if not failing or tried >= _most_attempts(task):
             return search, certified, tried
-    failing = _failing_draws(drawn, failed)
     digest = hashlib.sha256("\n".join([task.digest, *failing]).encode()).hexdigest()
     more = replace(
         task, own={**task.own, **failing}, drawn=(*task.drawn, *failing), digest=digest,
@@ -289,8 +290,9 @@ def _certify_search(
         spent=set(), earlier=len(search.spent),
     )  # fmt: skip
     again.resume(best_of_kinds(search.sort_candidates())[:_RESUMED])
-    if again.sort_candidates() or certified is None:
-        search = again if again.sort_candidates() else search
+    if again.sort_candidates():
+        search, certified = again, None
+    if certified is None:
         certified, tried = _verify_best(search, tried, files, progress)
     return search, certified, tried
 

@@ -152,17 +152,15 @@ def run_drawn(
 
     Steps of every required direction at the lightest and the heaviest payload, with the disturbance of the draws, the
     sensor's noise, and a load after the step; and each required margin at three amplitudes. Of the draws that swing
-    most there the margin itself is bisected. Attempt 0 takes the draws that a search may see. Equal
-    loops are run once in a process, as those of a controller that `tune` has verified.
+    most there the margin itself is bisected. Attempt 0 takes the draws that a search may see. Equal loops are run once
+    in a process, as those of a controller that `tune` has verified.
     """
     limits = [(b.metric, b.bound, b.limit) for b in asked.bounds if b.metric.startswith("sim.") or b.metric in _MARGINS]
 
     def compute() -> Drawn:
         return _run_all(name, draws, controller, asked, order, observer, attempt, progress)
 
-    found = compute_once(
-        compute, name, draws, controller, asked.tables, limits, order, observer, attempt
-    )  # fmt: skip
+    found = compute_once(compute, name, draws, controller, asked.tables, limits, order, observer, attempt)
     return replace(found, unreached=_unreached(draws, asked))
 
 

@@ -775,7 +775,7 @@ def test_a_search_goes_on_from_the_moved_start_of_a_kind_and_from_no_other(monke
 
 
 @pytest.mark.parametrize("drawn", [(), ("d",)])
-def test_where_draws_decide_a_kind_begins_at_the_better_of_its_limits_and_of_a_calmer_design(
+def test_where_draws_decide_a_kind_begins_at_the_better_of_its_limits_and_of_a_detuned_design(
     drawn: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     search = searching("ab", drawn=drawn)
@@ -797,12 +797,12 @@ def test_where_draws_decide_a_kind_begins_at_the_better_of_its_limits_and_of_a_c
     if not drawn:
         assert optimisers["pi"] is None
         return
-    calmer = pi.settings(optimisers["pi"].mean)
-    assert calmer["max_sensitivity"] < pi.settings(pi.start)["max_sensitivity"]
-    assert calmer["reference_time"][0] == pi.settings(pi.start)["reference_time"][0]
-    assert calmer["reference_time"][1] < pi.settings(pi.start)["reference_time"][1]
-    # At the end of the ranges nothing is calmer.
-    np.testing.assert_array_equal(mpc.calmer(0.0 * mpc.start), 0.0 * mpc.start)
+    detuned = pi.settings(optimisers["pi"].mean)
+    assert detuned["max_sensitivity"] < pi.settings(pi.start)["max_sensitivity"]
+    assert detuned["reference_time"][0] == pi.settings(pi.start)["reference_time"][0]
+    assert detuned["reference_time"][1] < pi.settings(pi.start)["reference_time"][1]
+    # At the end of the ranges nothing is detuned.
+    np.testing.assert_array_equal(mpc.detuned(0.0 * mpc.start), 0.0 * mpc.start)
 
 
 @pytest.mark.parametrize("own", [True, False])
@@ -1072,6 +1072,14 @@ def test_a_search_resumes_with_the_worst_draws_of_what_its_best_fails_but_a_litt
     # The best of each kind comes first, and what was spent is counted.
     assert again.starts == ["a", "b", "a"]
     assert (again.budget, again.earlier, again.spent) == (16, 3, set())
+
+
+def test_what_no_loop_over_draws_tells_resumes_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_tune, "_failing_draws", lambda *_: {})
+    for values, holds in ((FINE | {"sim.overshoot_pct": 5.1}, 1), (FINE, 9)):
+        search, (again, certified, tried), verified = resumable(monkeypatch, values, found=True, holds=holds)
+        assert again is search
+        assert (tried, certified.verification.holds) == (verified[-1], holds == 1)
 
 
 @pytest.mark.parametrize("found", [True, False])
