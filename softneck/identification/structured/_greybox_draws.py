@@ -18,7 +18,7 @@ from ._parameters import PARTS
 # Length of a segment [s of a neck's time]: ten of its time constants.
 _SEGMENT_S = 2.0
 # A draw whose squared error on the recordings is more than this multiple of the least does not explain them.
-# The score of held-out motions tells 2 from 3 on none of four necks, and single draws beyond 2 decided certificates.
+# With 3 held-out motions score better by 4 % on one of four test necks, and single draws beyond 2 decided certificates.
 _MOST_COST = 2.0
 # Step of the derivatives: far above rounding, far below the curvature of a number.
 _STEP = 1e-4
