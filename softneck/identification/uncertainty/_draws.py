@@ -48,6 +48,8 @@ _CALIBRATION_DRAWS = 40
 _MORE = tuple(1.1**k for k in range(25))
 # Deviations of disturbance and noise in the band: 95 % of a normal distribution.
 _DEVIATIONS = 1.96
+# Times in which a disturbance is forgotten, of which the likeliest is taken [s of a neck's time].
+_MEMORIES_S = np.geomspace(0.01, 10.0, 31)
 # Share of what is left over that is disturbance at least, where the sensor's noise explains all of it.
 _LEAST_DISTURBANCE = 0.05
 # Classes of amplitude, by the share of the largest motion of the segments.
@@ -214,7 +216,7 @@ def make_draws(
     if not math.isfinite(float(best.mean())):
         raise DataError("no draw has a finite simulation on the held-out motions; record longer.")
     _, source, factor, Y = next(item for item in tried if item[1] is winner and _no_worse(item[0], best))
-    share, keep = motions.disturbance(Y)
+    share, keep = motions.disturbance(Y, second / held.sample_time)
     more = next((more for more in _MORE if motions.covers(Y, more * share, keep)), _MORE[-1])
     rows = []
     rng = np.random.default_rng([seed, 1])
@@ -327,34 +329,38 @@ class _Motions:
         found = np.array([each[self.groups == k].mean() for k in range(len(self.motion))])
         return np.where(np.isfinite(found), found, math.inf)
 
-    def disturbance(self, Y: np.ndarray) -> tuple[Vector, float]:
-        """Return share (outputs,) and colour of what the nearest draw of each segment leaves over."""
-        keep, parts, noise, total = self._colour(Y), [], [], []
-        for k in range(len(self.motion)):
-            e, moved = self._left(Y, k, keep)
-            parts.append((e**2).sum(axis=0))
-            noise.append(len(e) * self.noise**2)
-            total.append(moved.sum(axis=0))
-        left = np.sum(parts, axis=0)
-        left = np.maximum(left - np.sum(noise, axis=0), _LEAST_DISTURBANCE * left)
-        return np.sqrt(left / np.maximum(np.sum(total, axis=0), 1e-300)), keep
+    def disturbance(self, Y: np.ndarray, second: float) -> tuple[Vector, float]:
+        """Return share (outputs,) and colour of what the nearest draw of each segment leaves over.
 
-    def _left(self, Y: np.ndarray, k: int, keep: float) -> tuple[Matrix, Matrix]:
-        """Return what the nearest draw leaves over (rows, outputs), and what a disturbance of share 1 would have."""
-        at = self.groups == k
-        errors = self.outputs[at] - Y[:, at]
-        nearest = int(np.argmin(np.nan_to_num((errors**2).sum(axis=(1, 2)), nan=np.inf)))
-        return errors[nearest], _filtered(np.diff(Y[nearest], axis=0, prepend=Y[nearest][:1]), keep)[at]
+        The share explains its variance. The colour is the likeliest: of pairs of neighbours (Varin, Reid and Firth
+        2011, Stat. Sinica 21:5), normal with the variances and the covariance that disturbance and noise have there.
+        `second`: samples in one of a neck.
+        """
+        near, there = self._nearest(Y), self.groups >= 0
+        pairs = there[1:] & (self.groups[1:] == self.groups[:-1])
+        e = self.outputs - np.take_along_axis(Y, near[None, :, None], axis=0)[0]
+        left = (e[there] ** 2).mean(axis=0)
+        left = np.maximum(left - self.noise**2, _LEAST_DISTURBANCE * left)
+        moves, tried = np.diff(Y, axis=1, prepend=Y[:, :1]), []
+        for memory in _MEMORIES_S:
+            keep = math.exp(-1.0 / (memory * second))
+            variance = np.empty_like(e)
+            for number in np.unique(near[there]):
+                variance[near == number] = _filtered(moves[number], keep)[near == number]
+            square = left / np.maximum(variance[there].mean(axis=0), 1e-300)
+            cost = _pair_cost(e[:-1][pairs], e[1:][pairs], square * variance[:-1][pairs], square * variance[1:][pairs],
+                              keep, np.maximum(self.noise**2, 1e-9 * left + 1e-100))  # fmt: skip
+            tried.append((cost, np.sqrt(square), keep))
+        _, share, keep = min(tried, key=lambda item: item[0])
+        return share, keep
 
-    def _colour(self, Y: np.ndarray) -> float:
-        """Return the factor by which what is left over decays in one sample."""
-        top = bottom = 0.0
+    def _nearest(self, Y: np.ndarray) -> np.ndarray:
+        """Return the number (rows,) of the draw with the least squared error in the segment of each row."""
+        found = np.zeros(len(self.groups), dtype=int)
         for k in range(len(self.motion)):
-            e = self._left(Y, k, 0.0)[0]
-            top += float((e[1:] * e[:-1]).sum())
-            # White noise is in the variance, and in no covariance.
-            bottom += float(np.maximum((e[:-1] ** 2).sum(axis=0) - (len(e) - 1) * self.noise**2, 0.0).sum())
-        return float(np.clip(top / max(bottom, 1e-300), 0.0, 0.999))
+            at = self.groups == k
+            found[at] = np.argmin(np.nan_to_num(((self.outputs[at] - Y[:, at]) ** 2).sum(axis=(1, 2)), nan=np.inf))
+        return found
 
     def band(self, Y: np.ndarray, share: Vector, keep: float) -> tuple[Matrix, Matrix]:
         """Return the lowest and highest outputs (rows, outputs) of the draws with their disturbance."""
@@ -380,6 +386,13 @@ class _Motions:
     def covers(self, Y: np.ndarray, share: Vector, keep: float) -> bool:
         """Return whether the band covers the level at every amplitude."""
         return all(row["covered"] >= LEVEL for row in self.coverage(Y, share, keep))
+
+
+def _pair_cost(e: Matrix, then: Matrix, before: Matrix, after: Matrix, keep: float, noise: Vector) -> float:
+    """Return minus twice the log-likelihood of neighbours e, `then` with variances `before`, `after` and a noise."""
+    a, b, c = before + noise, after + noise, keep * before
+    determinant = a * b - c**2
+    return float((np.log(determinant) + (b * e**2 - 2.0 * c * e * then + a * then**2) / determinant).sum())
 
 
 def _noise(recording: Recording) -> Vector:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from softneck.core import DataError, FileFormatError, SettingsError, load
 from softneck.identification import Draws, Family, Model, make_draws
@@ -266,7 +267,7 @@ def test_a_noisier_sensor_is_no_larger_disturbance(made: Callable[..., Draws], r
     # 450 rows tell a deviation to 1 / sqrt(900) = 3 %, fourth differences to about three times that.
     np.testing.assert_allclose(after.noise, np.hypot(before.noise, added), rtol=0.15)
     Y = before.simulate(draws)
-    share, louder = before.disturbance(Y)[0], after.disturbance(Y)[0]
+    share, louder = before.disturbance(Y, 50.0)[0], after.disturbance(Y, 50.0)[0]
     # Left over would be the noise, added to both in squares; what a wrong estimate of 15 % leaves is half of it.
     motion = np.abs(np.diff(held.outputs, axis=0)).mean(axis=0)
     assert (louder < share + 0.5 * added / motion).all()
@@ -363,23 +364,23 @@ def test_what_is_left_over_is_of_the_nearest_draw_of_each_segment() -> None:
     Y = rng.normal(size=(3, 10, 2))
     y = np.concatenate([Y[2, :5], Y[0, 5:]])
     for draws in (Y, Y[::-1]):
-        share, _ = segments(y).disturbance(draws)
+        share, _ = segments(y).disturbance(draws, 50.0)
         np.testing.assert_array_equal(share, 0.0)
     # Each of three segments has its own, and rows of none have none.
     groups = np.array([-1, 0, 0, 0, 1, 1, 1, 2, 2, 2])
     each = np.concatenate([Y[2, :1] + 9.0, Y[2, 1:4], Y[0, 4:7], Y[1, 7:]])
     three = replace(segments(each), groups=groups, motion=np.ones(3), classes=np.zeros(3, dtype=int))
-    np.testing.assert_array_equal(three.disturbance(Y)[0], 0.0)
+    np.testing.assert_array_equal(three.disturbance(Y, 50.0)[0], 0.0)
     # Draws that do not move leave a share that is a number.
-    assert np.isfinite(segments(y).disturbance(np.zeros((2, 10, 2)))[0]).all()
+    assert np.isfinite(segments(y).disturbance(np.zeros((2, 10, 2)), 50.0)[0]).all()
     # A nearer draw never leaves more, and one that diverged is near to nothing.
-    far, lost = segments(y).disturbance(Y[:1])[0], Y.copy()
+    far, lost = segments(y).disturbance(Y[:1], 50.0)[0], Y.copy()
     lost[2, 3, 1] = np.nan
     assert (far > 0.0).any()
-    assert (segments(y).disturbance(lost)[0] > 0.0).any()
+    assert (segments(y).disturbance(lost, 50.0)[0] > 0.0).any()
     spoilt = Y.copy()
     spoilt[1] = np.nan
-    np.testing.assert_array_equal(segments(y).disturbance(spoilt)[0], 0.0)
+    np.testing.assert_array_equal(segments(y).disturbance(spoilt, 50.0)[0], 0.0)
 
 
 @pytest.mark.parametrize(("keep", "share", "noise"), [(0.9, 0.2, 0.0), (0.5, 0.4, 0.0), (0.95, 0.3, 0.02)])
@@ -393,7 +394,7 @@ def test_share_and_colour_of_a_disturbance_are_found(keep: float, share: float, 
     y = draw + d + noise * rng.standard_normal((rows, 2))
     groups, nothing = np.repeat([0, 1], rows // 2), SimpleNamespace()
     motions = _draws._Motions(nothing, nothing, y, groups, np.ones(2), np.array([1, 2]), np.full(2, noise))  # pyright: ignore[reportArgumentType]
-    found, colour = motions.disturbance(np.array([draw, draw + 9.0]))
+    found, colour = motions.disturbance(np.array([draw, draw + 9.0]), 50.0)
     # 8,000 rows with a colour of 0.95 are some 200 that are independent: a deviation to 5 %.
     np.testing.assert_allclose(found, share, rtol=0.15)
     assert colour == pytest.approx(keep, abs=0.04)
@@ -401,6 +402,31 @@ def test_share_and_colour_of_a_disturbance_are_found(keep: float, share: float, 
     rows_of = motions.coverage(np.array([draw]), found, colour)
     assert [row["covered"] for row in rows_of] == pytest.approx([0.95, 0.95], abs=0.02)
     assert [(row["class"], row["segments"]) for row in rows_of] == [("middle", 1), ("large", 1)]
+
+
+def test_an_error_that_rests_where_nothing_moves_is_covered_by_a_small_share() -> None:
+    """A staircase whose every step stops 2 % beside the draw's, with a glitch of one sample: not 240 % of each move."""
+    rng, levels, each = np.random.default_rng(4), 80, 60
+    held = np.repeat(rng.uniform(-1.0, 1.0, levels), each)
+    draw = signal_of(held, 0.12)
+    away = signal_of(np.repeat(0.02 * rng.standard_normal(levels), each), 0.12)
+    away[each::each] += 0.05 * rng.choice([-1.0, 1.0], levels - 1)
+    y = (draw + away + 0.002 * rng.standard_normal(held.size))[:, None]
+    groups, nothing = np.repeat([0, 1], held.size // 2), SimpleNamespace()
+    motions = _draws._Motions(nothing, nothing, y, groups, np.ones(2), np.array([1, 2]), np.array([0.002]))  # pyright: ignore[reportArgumentType]
+    Y = draw[None, :, None]
+    share, keep = motions.disturbance(Y, 50.0)
+    # A step of 1 has some ten moves of 0.1: errors of 0.02 are sqrt(10) * 0.1 * share.
+    assert share[0] < 0.3
+    # An offset stays for a level of 60 samples at least: `keep` is no less than exp(-1/60).
+    assert keep > 0.98
+    # 0.95 are asked for, of offsets that are not normal: more than the share, far from the largest factor, 9.8.
+    assert motions.covers(Y, 2.0 * share, keep)
+
+
+def signal_of(inputs: np.ndarray, rate: float) -> np.ndarray:
+    """Return `y[k+1] = y[k] + rate (u[k] - y[k])`."""
+    return np.asarray(lfilter([0.0, rate], [1.0, rate - 1.0], inputs))
 
 
 def test_the_variance_of_a_disturbance_follows_its_recursion() -> None:
