@@ -260,7 +260,7 @@ def _anew(study: cosim.Study, folder: Path, output: Path | None, force: bool) ->
 def _summary(runs: pd.DataFrame, folder: Path, objectives: tuple[str, ...], worst: list[Path]) -> dict[str, Any]:
     from softneck.report import failures
 
-    held = runs["holds"].dropna().tolist()
+    held = cosim.held_runs(runs).dropna().tolist()
     return {
         "folder": str(folder),
         "runs": len(runs),

@@ -77,13 +77,16 @@ METRICS = {
     "outside": Metric("samples outside what the model has seen", "mean"),
     "log_likelihood": Metric("log likelihood of a measurement", "mean", larger=True),
     "checks": Metric("look-ahead error, rms", "mean"),
+    # Runs of a study.
+    "failed": Metric("runs that failed", "mean"),
+    "holds": Metric("runs that keep their limits", "mean", larger=True),
 }
 
 
 def metric_of(name: str) -> Metric:
     """Return the metric of a name such as "sim.rise_s" or "motors.max_bar"; raise SettingsError if there is none."""
-    last = f"{name.rpartition('.')[2]}_"
-    # What follows is a unit: `load_rms_mm`, `rise_s`.
+    # What follows is a unit, or which of several runs: `load_rms_mm`, `rise_s`, `rise_s worst`, `holds [%]`.
+    last = f"{name.partition(' ')[0].rpartition('.')[2]}_"
     known = max((key for key in METRICS if last.startswith(f"{key}_")), key=len, default=None)
     if known is None:
         raise SettingsError(f"`{name}` is not a metric of softneck; register it in `softneck.core._metrics`.")

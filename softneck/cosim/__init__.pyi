@@ -34,6 +34,7 @@ from .studies._run_study import WorkerPool as WorkerPool
 from .studies._run_study import open_workers as open_workers
 from .studies._run_study import run_study as run_study
 from .studies._store import STUDY_FILE as STUDY_FILE
+from .studies._store import held_runs as held_runs
 from .studies._store import pareto_rows as pareto_rows
 from .studies._store import read_study_description as read_study_description
 from .studies._store import write_worst as write_worst

@@ -402,8 +402,8 @@ def distribution_chart(values: Mapping[str, Mapping[str, Vector]], title: str, *
     """Describe distributions over runs, metric -> group -> (n,): a panel for each metric, a curve for each group."""
     panels = []
     for metric, groups in values.items():
-        known = {name: np.asarray(v, float)[np.isfinite(np.asarray(v, float))] for name, v in groups.items()}
-        known = {name: v for name, v in known.items() if v.size}
+        known = {name: np.asarray(v, float) for name, v in groups.items()}
+        known = {name: v for name, v in known.items() if np.isfinite(v).any()}
         if known:
             panels.append(_shares(metric, known, legend=not panels))
     if not panels:
@@ -441,8 +441,9 @@ def pareto_figure(
 
 
 def _shares(metric: str, groups: Mapping[str, Vector], *, legend: bool) -> Panel:
-    """Return a panel with the share of each group's runs in common bins."""
+    """Return a panel with the share of each group's runs in common bins; no bin has what is not finite."""
     every = np.concatenate(list(groups.values()))
+    every = every[np.isfinite(every)]
     low, high = float(every.min()), float(every.max())
     if high - low <= 1e-12 * max(1.0, abs(high)):
         low, high = low - 0.5, high + 0.5
@@ -450,7 +451,7 @@ def _shares(metric: str, groups: Mapping[str, Vector], *, legend: bool) -> Panel
     middles = 0.5 * (edges[:-1] + edges[1:])
     curves = []
     for (name, values), (colour, _) in zip(groups.items(), curve_styles(), strict=False):
-        share = 100.0 * np.histogram(values, edges)[0] / values.size
+        share = 100.0 * np.histogram(values[np.isfinite(values)], edges)[0] / values.size
         single = len(groups) == 1
         curves.append(Curve(middles, share, name, colour, "bars" if single else "marked"))
     return Panel(curves, "share of runs [%]", x_label=metric, legend=legend and len(groups) > 1)

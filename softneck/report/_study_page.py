@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.cosim import group_runs, pareto_front, rank, worst_runs
+from softneck.cosim import group_runs, held_runs, pareto_front, rank, worst_runs
 from softneck.plots import Chart, Section, Table, cell, distribution_chart, influence_chart, page, pareto_chart
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def study_verdict(description: Mapping[str, Any], runs: pd.DataFrame) -> str:
 
 def kept_runs(runs: pd.DataFrame) -> str:
     """Return how many runs keep all limits, in words."""
-    held = runs["holds"].dropna().tolist()
+    held = held_runs(runs).dropna().tolist()
     return f"{sum(map(bool, held))} of {len(held)} runs keep all limits" if held else f"{len(runs)} runs, no limits"
 
 
@@ -86,7 +86,7 @@ def short_key(key: str) -> str:
 
 def _overview(description: Mapping[str, Any], runs: pd.DataFrame, objectives: list[str]) -> Section:
     study = description["study"]
-    failed, held = sum(failures(runs)), runs["holds"].dropna().tolist()
+    failed, held = sum(failures(runs)), held_runs(runs).dropna().tolist()
     text = [f"{len(runs)} of {study['runs']} runs, seed {study['seed']}."]
     if held:
         text.append(f"{100.0 * sum(held) / len(held):.1f} % keep all limits.")

@@ -54,19 +54,25 @@ class Tuner {
     const most = 0.8 * one.x, fast = this.candidates.filter(other => other.x <= most);
     const goal = `20 % faster (${this.x_name} at most ${united(most, this.x_unit)})`;
     if (!fast.length) return `${goal}: no judged candidate is.`;
-    const far = other => this.broken(other).length * 1e6 + (other.speed - one.speed) ** 2 + (other.caution - one.caution) ** 2;
+    // Not computed is not kept.
+    const missing = other => this.requirements.filter((_, k) => this.verdicts(other)[k] === "not computed");
+    const far = other => (this.broken(other).length + missing(other).length) * 1e6 + (other.speed - one.speed) ** 2 + (other.caution - one.caution) ** 2;
     const other = fast.reduce((a, b) => far(b) < far(a) ? b : a);
     const worse = this.requirements.filter((item, k) => {
       const [a, b] = [one.values[k], other.values[k]];
       if (a === null || b === null) return false;
-      return item.bound === "min" ? b < 0.95 * a : b > 1.05 * a;
+      // What is no number is worse.
+      return !(item.bound === "min" ? b >= 0.95 * a : b <= 1.05 * a);
     });
     const list = worse.slice(0, 5).map(item => { const k = this.requirements.indexOf(item);
       return `${item.name} ${united(other.values[k], item.unit)} instead of ${shown(one.values[k])}`; }).join("; ");
     const broken = this.broken(other);
     const ends = broken.length ? ` It breaks: ${broken.map(item => item.name).join("; ")}.` : " It keeps all computed requirements.";
+    const open = [...missing(other).map(item => item.name), ...this.elsewhere];
+    const unknown = (open.length ? ` Not computed of it: ${open.join("; ")}.` : "")
+      + (other.level < one.level ? " It was judged by fewer loops." : "");
     return `${goal}: candidate ${other.number} (${other.kind}, ${united(other.x, this.x_unit)}) costs `
-      + `${list || "nothing that is required"}${worse.length > 5 ? "; and more" : ""}.${ends}`;
+      + `${list || "nothing that is required"}${worse.length > 5 ? "; and more" : ""}.${ends}${unknown}`;
   }
   move() {
     this.choose(this.nearest(at("speed").valueAsNumber, at("caution").valueAsNumber));

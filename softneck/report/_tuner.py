@@ -16,7 +16,7 @@ from markupsafe import escape
 from softneck.core import metric_of
 from softneck.loop import error_unit
 from softneck.plots import BLUE, GREEN, GREY, MOTOR_COLOURS, ORANGE, Chart, Curve, Panel, Script, Section, cell, page
-from softneck.tuning import circle_angles, curve_times, has_observer, objectives
+from softneck.tuning import LEVELS, circle_angles, curve_times, has_observer, objectives
 from softneck.verification import metric_title
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def tuner_values(found: Tuned, folder: Path, plants: Mapping[str, Path], certifi
             "values": [_number(item.metrics.get(metric)) for metric in metrics],
             "unproven": [_unproven(item, bound, broken) for bound in bounds],
             "x": _number(item.metrics[x]), "y": _number(item.metrics[y]), "speed": shown.speed[k],
-            "caution": shown.caution[k], "curves": dict(item.curves), "file": str(own),
+            "caution": shown.caution[k], "level": _level(item), "curves": dict(item.curves), "file": str(own),
             "command": design_command(found, item, own, folder, plants),
         })  # fmt: skip
     return {
@@ -145,8 +145,10 @@ _MAX_COSTS = 4
 def faster_values(found: Tuned) -> dict[str, Any] | None:
     """Return the JSON values of what it costs to be 20 % faster than the best; None if it has no finite speed.
 
-    `candidate`: number on the tuner page of that which breaks least, of equals the nearest, or None. `costs`: metric ->
-    values of the best and of it, where worse by more than a twentieth. `breaks`: the requirements that it breaks.
+    `candidate`: number on the tuner page of that which breaks least, or has least not computed, of equals the nearest,
+    or None. `costs`: metric -> values of the best and of it, where worse by more than a twentieth. `breaks`: the
+    requirements that it breaks. `not_computed`: those of which the search does not know whether it keeps them.
+    `fewer_loops`: whether the best was judged by more loops.
     """
     items, task, shown = found.candidates, found.task, _judged(found)
     best = next((k for k, item in enumerate(items) if item is found.best), None)
@@ -157,10 +159,14 @@ def faster_values(found: Tuned) -> dict[str, Any] | None:
 
     def far(k: int) -> tuple[int, float]:
         places = ((each[k] - each[best]) ** 2 for each in (shown.speed, shown.caution))
-        return len(broken(k)), sum(places)
+        return len(broken(k)) + len(missing(k)), sum(places)
 
     def broken(k: int) -> list[str]:
         return [metric for metric, ratio in items[k].ratios(shown.bounds, tested=task.tested).items() if ratio > 1.0]
+
+    def missing(k: int) -> list[str]:
+        known = items[k].ratios(task.bounds, tested=task.tested)
+        return [metric for metric in dict.fromkeys(b.metric for b in task.bounds) if metric not in known]
 
     fast = [k for k in shown.order if items[k].metrics[shown.x] <= most]
     if not fast:
@@ -172,7 +178,8 @@ def faster_values(found: Tuned) -> dict[str, Any] | None:
         if a is not None and b is not None and not (b >= 0.95 * a if bound.bound == "min" else b <= 1.05 * a):
             costs[bound.metric] = {"best": _number(a), "faster": _number(b), "unit": _unit(bound.metric, task.robot)}
     return {**said, "candidate": shown.order.index(other) + 1, "kind": items[other].kind,
-            "value": items[other].metrics[shown.x], "costs": costs, "breaks": broken(other)}  # fmt: skip
+            "value": items[other].metrics[shown.x], "costs": costs, "breaks": broken(other),
+            "not_computed": missing(other), "fewer_loops": _level(items[other]) < _level(items[best])}  # fmt: skip
 
 
 def faster_words(one: Mapping[str, Any] | None, tuner: str) -> str:
@@ -186,8 +193,10 @@ def faster_words(one: Mapping[str, Any] | None, tuner: str) -> str:
     costs = [f"{_name(metric)} {cell(each['best'], '.3g')} -> {cell(each['faster'], '.3g')} {each['unit']}".rstrip()
              for metric, each in ordered]  # fmt: skip
     costs[_MAX_COSTS:] = [f"{len(costs) - _MAX_COSTS} more"] if len(costs) > _MAX_COSTS else []
-    broken = len(one["breaks"])
+    broken, missing = len(one["breaks"]), len(one["not_computed"])
     ends = f"breaks {broken} of the requirements" if broken else "keeps all computed requirements"
+    ends += f"; {missing} were not computed of it" if missing else ""
+    ends += "; it was judged by fewer loops" if one["fewer_loops"] else ""
     return (
         f"{goal}: candidate {one['candidate']} of {tuner} ({one['kind']}, {one['value']:.3g} {one['unit']}) costs "
         f"{'; '.join(costs) or 'nothing that is required'}, and {ends}."
@@ -217,6 +226,10 @@ def _unproven(item: Candidate, bound: Any, ratios: Mapping[str, float]) -> bool:
     return bound.metric in ratios and math.isinf(ratios[bound.metric]) and math.isfinite(
         item.metrics.get(bound.metric, 0.0)
     )  # fmt: skip
+
+
+def _level(item: Candidate) -> int:
+    return LEVELS.index(item.level)
 
 
 def _places(values: Sequence[float]) -> list[float]:

@@ -7,10 +7,13 @@ import math
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from softneck import loop
 from softneck.core import METRICS, SettingsError, metric_of, worst
+from softneck.cosim import group_runs
+from softneck.cosim.studies import _store
 from softneck.design.plants._uncertain import StepAndLoadResult
 from softneck.estimation._noise import Consistency, NoiseFit
 from softneck.estimation._observer import FittedObserver
@@ -48,11 +51,24 @@ def numbers_of(result: type) -> set[str]:
     return named - NO_METRICS[result]
 
 
+# What tells runs of a study apart and has no better direction.
+NO_COLUMNS = {"kind", "runs"}
+
+
+def columns_of_a_study(robot: Robot) -> set[str]:
+    """Return the columns of a study's groups, of all metrics of its runs."""
+    metrics = loop.metric_names(robot)
+    holds = pd.array([True], "boolean")
+    runs = pd.DataFrame({"kind": ["a"], "error": [""], "holds": holds, **{name: [1.0] for name in metrics}})
+    return set(group_runs(runs, ["kind"], metrics).columns) - NO_COLUMNS
+
+
 # What `softneck` states, for the neck and for a robot in other units.
 STATED = sorted(
     {
         *(name for robot in (Robot.preset(), PRESSURE) for name in metric_names(robot, track=True)),
         *(name for robot in (Robot.preset(), PRESSURE) for name in loop.metric_names(robot)),
+        *(name for robot in (Robot.preset(), PRESSURE) for name in columns_of_a_study(robot)),
         "validity.min", *SCORES, *(name for result in NO_METRICS for name in numbers_of(result)),
     }
 )  # fmt: skip
@@ -81,7 +97,7 @@ def test_margins_and_fits_are_better_when_larger_and_all_else_when_smaller() -> 
     assert not any(metric_of(name).larger for name in SMALL)
     assert {key for key, item in METRICS.items() if item.larger} == {
         "disk_margin", "gain_margin", "phase_margin", "delay_margin", "min", "fits", "r2", "cold_fits", "coverage",
-        "log_likelihood",
+        "log_likelihood", "holds",
     }  # fmt: skip
     assert set(SCORES) <= numbers_of(Validation)
 
@@ -107,6 +123,15 @@ def test_a_loop_states_the_metrics_that_are_registered_for_its_robot_and_no_othe
     found = loop.metrics(result)
     stated = {f"{group}.{name}" for group, values in found.items() for name in values}
     assert stated == {*loop.metric_names(robot), "validity.min"}
+
+
+def test_a_column_of_a_study_that_is_not_registered_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_store, "_spread", lambda _: {"worst": 1.0})
+    assert columns_of_a_study(PRESSURE) > {"failed", "holds [%]", "tip.rise_s worst"}
+    for name in columns_of_a_study(PRESSURE):
+        assert metric_of(name).larger is (name == "holds [%]")
+    with pytest.raises(SettingsError, match="register it"):
+        metric_of("charm [%]")
 
 
 def test_the_longest_name_counts_and_units_do_not() -> None:

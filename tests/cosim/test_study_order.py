@@ -19,12 +19,14 @@ import pandas as pd
 import pytest
 
 from softneck.core import DataError, FileFormatError, OutputFileError, SettingsError, metric_of
-from softneck.cosim import group_runs, make_study, pareto_front, rank, read_runs, worst_runs
+from softneck.cosim import group_runs, held_runs, make_study, pareto_front, rank, read_runs, worst_runs
 from softneck.cosim.loops._loop_table import OBJECT
 from softneck.cosim.studies import _run_study, _store, _study
 from softneck.cosim.studies._store import Store, _spread, column_types, pareto_rows, read_tables, write_worst
 from softneck.cosim.studies._study import Vary
 from softneck.loop import metric_names
+from softneck.plots import distribution_chart
+from softneck.report._study_page import kept_runs
 from softneck.robot import Robot
 
 METRICS = metric_names(Robot.preset())
@@ -85,9 +87,24 @@ def test_a_failed_run_counts_in_the_spread_and_in_the_share_that_holds() -> None
         assert (found["runs"], found["failed"], found["holds [%]"]) == (4, 1, 50.0)
         assert found["worst"] == math.inf
         assert found["median"] == 2.0
+        # The page, the command's JSON and the sentence count it too.
+        runs = runs_of((1.0, lost), holds=[True, None], errors=["", "diverged"])
+        assert held_runs(runs).tolist() == [True, False]
+        assert kept_runs(runs) == "1 of 2 runs keep all limits"
+    # A run of a group that has no name is no run less.
+    runs = runs_of((1.0, 2.0, 3.0)).assign(kind=["a", None, math.nan])
+    assert sum(group_runs(runs, ["kind"], [ERROR])["runs"].tolist()) == 3
     # Without limits nothing holds or fails.
     assert math.isnan(grouped(runs_of((1.0, 2.0)))["holds [%]"])
     assert math.isnan(grouped(runs_of((1.0, 2.0), errors=["", "gone"]))["holds [%]"])
+
+
+@pytest.mark.parametrize("lost", [math.nan, math.inf])
+def test_shares_of_a_group_are_of_all_its_runs(lost: float) -> None:
+    """Among those that ended alone, a group of which half diverged would look like one of which none did."""
+    groups = {"a": np.array([1.0, 2.0, lost, lost]), "b": np.array([1.0, 2.0]), "c": np.array([lost])}
+    (panel,) = distribution_chart({ERROR: groups}, "t").panels
+    assert {curve.label: curve.y.sum() for curve in panel.curves} == {"a": 50.0, "b": 100.0}
 
 
 @pytest.mark.parametrize("limits", [(), ("limit",)])

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from softneck.core import write_certificate
@@ -24,7 +25,10 @@ from softneck.report._decisions import (
     project_decision,
     validation_decision,
 )
-from softneck.verification import certificate_values, metric_words
+from softneck.report._tuner import faster_values, faster_words
+from softneck.robot import Robot
+from softneck.tuning import Candidate
+from softneck.verification import Requirement, certificate_values, metric_words
 
 from ..data import ROOT, neck_recording
 
@@ -118,6 +122,48 @@ def test_a_model_that_design_would_refuse_is_not_to_be_used(entry: dict[str, Any
 
 def test_a_fit_that_is_no_number_equals_nothing() -> None:
     assert [beats(math.nan, 1.0), beats(1.0, math.nan), beats(1.0, 1.0)] == ["", "", "equals"]
+
+
+RISE, GAIN, LOAD = (
+    Requirement("sim.rise_s", "max", 1.0, False), Requirement("axes.gain_margin", "min", 2.0, False),
+    Requirement("step.load_rms_deg", "max", 1.0, False),
+)  # fmt: skip
+
+
+def faster(*others: tuple[str, dict[str, float]]) -> dict[str, Any]:
+    """Return what it costs to be faster than a best with all values, among candidates (level, values)."""
+    best = {"sim.rise_s": 1.0, "axes.gain_margin": 3.0, "step.load_rms_deg": 0.5}
+    items = [
+        Candidate("pi", {"k": k}, np.zeros(1), level, {"axes.sensitivity": 1.0 + k, **metrics})
+        for k, (level, metrics) in enumerate([("margins", best), *others])
+    ]
+    task = SimpleNamespace(bounds=(RISE, GAIN, LOAD), robot=Robot.preset(), tested=False)
+    found: Any = SimpleNamespace(candidates=items, task=task, best=items[0])
+    values = faster_values(found)
+    assert values is not None
+    return values
+
+
+def test_what_is_not_computed_of_a_faster_candidate_is_said_and_not_kept() -> None:
+    full = {"sim.rise_s": 0.5, "axes.gain_margin": 2.5, "step.load_rms_deg": 0.5}
+    one = faster(("margins", full))
+    assert (one["breaks"], one["not_computed"], one["fewer_loops"]) == ([], [], False)
+    assert faster_words(one, "p").endswith("gain margin, worst axis 3 -> 2.5, and keeps all computed requirements.")
+    # One that breaks nothing because little was computed of it is none that keeps all.
+    bare = {"sim.rise_s": 0.3}
+    for order in ([("all", bare), ("all", full)], [("all", full), ("all", bare)]):
+        one = faster(*order)
+        assert (one["value"], one["not_computed"], one["fewer_loops"]) == (0.5, [], True)
+    one = faster(("all", bare))
+    assert one["not_computed"] == ["axes.gain_margin", "step.load_rms_deg"]
+    assert faster_words(one, "p").endswith(
+        "keeps all computed requirements; 2 were not computed of it; it was judged by fewer loops."
+    )
+    # A value that is no number costs, and breaks.
+    one = faster(("margins", full | {"step.load_rms_deg": math.nan}))
+    assert (one["breaks"], set(one["costs"])) == (["step.load_rms_deg"], {"axes.gain_margin", "step.load_rms_deg"})
+    assert faster(("margins", full | {"sim.rise_s": 0.81}))["candidate"] is None
+    assert faster(("margins", full | {"sim.rise_s": 0.8}))["candidate"] == 1
 
 
 def test_ahead_is_judged_beside_the_last_sample(entry: dict[str, Any]) -> None:

@@ -217,6 +217,13 @@ def test_the_decision_prices_20_percent_more_speed_as_the_page_does(made: Made, 
     assert other["x"] == one["value"] <= one["at_most"]
     assert f"candidate {one['candidate']} of tuner.html (pi, {one['value']:.3g} s) costs " in said
     assert f"candidate {one['candidate']} (pi, " in page
+    # What the search has not computed of it is said on both.
+    assert set(one["not_computed"]) >= {item["metric"] for k, item in enumerate(made.data["requirements"])
+                                        if other["values"][k] is None and not other["unproven"][k]}  # fmt: skip
+    for text, said_open in ((page, "Not computed of it: "), (said, "were not computed of it")):
+        assert (said_open in text) is bool(one["not_computed"])
+        assert ("judged by fewer loops" in text) is one["fewer_loops"] is (other["level"] < best["level"])
+    assert all(name in page for name in made.data["elsewhere"])
     told = 0
     for k, item in enumerate(made.data["requirements"]):
         (before, after), cost = (each["values"][k] for each in (best, other)), one["costs"].get(item["metric"])

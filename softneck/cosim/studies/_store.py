@@ -262,13 +262,11 @@ def group_runs(runs: pd.DataFrame, by: Sequence[str], metrics: Sequence[str]) ->
     """Return for each combination of values of `by`: runs, failed runs, share that holds, spread of the metrics."""
     import pandas as pd
 
-    rows, limited = [], bool(runs["holds"].notna().any())
-    for values, part in runs.groupby(list(by), sort=False):
+    rows = []
+    for values, part in runs.assign(holds=held_runs(runs)).groupby(list(by), sort=False, dropna=False):
         row: dict[str, Any] = dict(zip(by, values if isinstance(values, tuple) else (values,), strict=True))
-        failed = np.array([bool(error) for error in part["error"].tolist()])
-        # A failed run holds no limit, and no metric of it is known.
-        held = [False if bad else bool(holds) for holds, bad in zip(part["holds"], failed, strict=True)
-                if limited and (bad or not pd.isna(holds))]  # fmt: skip
+        # No metric of a failed run is known.
+        failed, held = part["error"].to_numpy() != "", part["holds"].dropna().tolist()
         row |= {"runs": len(part), "failed": int(failed.sum())}
         row["holds [%]"] = 100.0 * sum(held) / len(held) if held else math.nan
         for metric in metrics:
@@ -276,6 +274,16 @@ def group_runs(runs: pd.DataFrame, by: Sequence[str], metrics: Sequence[str]) ->
             row |= {f"{metric} {name}": value for name, value in _spread(y).items()}
         rows.append(row)
     return pd.DataFrame(rows)
+
+
+def held_runs(runs: pd.DataFrame) -> pd.Series:
+    """Return whether each run keeps its limits: one that failed does not; NA where no run has any."""
+    import pandas as pd
+
+    kept, errors = runs["holds"].tolist(), runs["error"].tolist()
+    limited = not all(map(pd.isna, kept))
+    held = [False if limited and error else one for one, error in zip(kept, errors, strict=True)]
+    return pd.Series(held, index=runs.index, dtype="boolean")
 
 
 def _spread(y: Vector) -> dict[str, float]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -195,7 +197,10 @@ def test_a_draw_that_diverges_makes_its_segment_infinitely_bad_and_no_other(lost
         assert segments(y).scores(spoilt).tolist() == [scores[0], np.inf]
     # An error that grows in every draw never improves a score; small motions are judged by their own size.
     assert (segments(y).scores(Y + 9.0) > scores).all()
-    assert segments(y).scores(np.broadcast_to(y + 0.1, Y.shape)) == pytest.approx([1.0, 0.1])
+    off = np.broadcast_to(y + 0.1, Y.shape)
+    assert segments(y).scores(off) == pytest.approx([1.0, 0.1])
+    # One that rests counts as a twentieth of the largest motion, else its noise would decide.
+    assert replace(segments(y), motion=np.array([0.0, 1.0])).scores(off) == pytest.approx([2.0, 0.1])
 
 
 def test_what_a_recording_moves_is_the_largest_from_its_middle() -> None:
@@ -291,12 +296,15 @@ def test_draws_of_a_neck_are_grey_boxes_that_cover_a_new_recording() -> None:
         assert row["covered"] >= found.level - 0.1
 
 
-@pytest.mark.parametrize(("second", "rows"), [(1.0, 100), (4.17, 128), (6.0, 150)])
-def test_one_short_run_of_a_slow_robot_has_two_segments_at_least(second: float, rows: int) -> None:
+@pytest.mark.parametrize(
+    ("second", "held", "rows"),
+    [(1.0, 256, 100), (4.17, 256, 128), (6.0, 256, 150), (1.0, 100, 50), (1.0, 101, 100), (2.0, 199, 100)],
+)
+def test_one_short_run_of_a_slow_robot_has_two_segments_at_least(second: float, held: int, rows: int) -> None:
     """A tank of 208 s time constant at 4 s a sample: 256 rows held out, where a usual segment has 417."""
-    motions = _draws._Motions.of(neck_recording(256), Model(kind="rls", sample_time=0.02, arrays={}), second)
+    motions = _draws._Motions.of(neck_recording(held), Model(kind="rls", sample_time=0.02, arrays={}), second)
     found, counts = np.unique(motions.groups[motions.groups >= 0], return_counts=True)
-    assert found.tolist() == [*range(-(-256 // rows))]
+    assert found.tolist() == [*range(-(-held // rows))]
     assert counts[0] == rows - _draws.WARM_UP
 
 
@@ -427,6 +435,40 @@ def test_an_error_that_rests_where_nothing_moves_is_covered_by_a_small_share() -
 def signal_of(inputs: np.ndarray, rate: float) -> np.ndarray:
     """Return `y[k+1] = y[k] + rate (u[k] - y[k])`."""
     return np.asarray(lfilter([0.0, rate], [1.0, rate - 1.0], inputs))
+
+
+@pytest.mark.parametrize("left", ["constant", "alternating", "nothing"])
+@pytest.mark.parametrize("noise", [0.0, 0.06, 99.0])
+def test_a_disturbance_explains_what_is_left_less_noise_and_never_less_than_a_twentieth(
+    left: str, noise: float
+) -> None:
+    draw = np.cumsum(np.ones((10, 2)), axis=0)
+    e = {"constant": 0.1, "alternating": 0.1 * (-1.0) ** np.arange(10)[:, None], "nothing": 0.0}[left]
+    share, keep = segments(draw + e, noise).disturbance(draw[None], 50.0)
+    # It is forgotten within 0.01 to 10 s of a neck's time.
+    assert math.exp(-1.0 / (0.01 * 50.0)) - 1e-12 <= keep <= math.exp(-1.0 / (10.0 * 50.0)) + 1e-12
+    variance = _draws._filtered(np.diff(draw, axis=0, prepend=draw[:1]), keep).mean(axis=0)
+    square = float(np.mean(np.square(e)))
+    np.testing.assert_allclose(share**2 * variance, max(square - noise**2, 0.05 * square))
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-3, 0.01, 0.03])
+def test_the_noise_of_a_rounding_sensor_is_no_less_than_its_steps_tell(step: float) -> None:
+    """Rounding to steps `q` leaves an error of `q / sqrt(12)`, a uniform distribution's standard deviation."""
+    recording, least = neck_recording(450), step / math.sqrt(12.0)
+    y = recording.outputs
+    rounded = step * np.round(y / step) if step else y
+    found = _draws._noise(recording.with_channels(pitch=rounded[:, 0], roll=rounded[:, 1]))
+    plain = _draws._noise(recording)
+    # Two deviations of independent errors add in squares; the estimate of both is right to a factor of 1.5.
+    assert (found >= 0.999 * least).all()
+    assert (found <= 1.5 * np.hypot(plain, least)).all()
+
+
+def test_draws_of_one_certificate_are_the_fewest_that_tell_95_percent_with_95_percent_confidence() -> None:
+    """None of n draws fails with probability 0.95^n where 5 % of such plants do (Wilks 1941)."""
+    assert 0.95**_draws.DRAWS <= 0.05 < 0.95 ** (_draws.DRAWS - 1)
+    assert inspect.signature(make_draws).parameters["count"].default == _draws.SEARCH_DRAWS == _draws.DRAWS
 
 
 def test_the_variance_of_a_disturbance_follows_its_recursion() -> None:
