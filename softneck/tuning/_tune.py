@@ -331,10 +331,11 @@ def _failing_draws(drawn: Sequence[Drawn], failed: Sequence[Verdict]) -> dict[st
     found = {}
     for part, verdict in product(drawn, failed):
         bound = verdict.requirement
-        model = part.worst(bound.metric, largest=bound.bound != "min")
-        if model is not None:
-            found.setdefault(id(model.arrays), (f"{part.family}, attempt {part.attempt}, {bound.metric}", model))
-    return dict(list(found.values())[:_MORE_DRAWS])
+        number = part.worst(bound.metric, largest=bound.bound != "min")
+        if number is not None:  # one that is the worst in several metrics joins once
+            found.setdefault((part.family, number), (f"{part.family}, attempt {part.attempt}, {bound.metric}", part))
+    joined = list(found.items())[:_MORE_DRAWS]
+    return {name: part.model(number) for (_, number), (name, part) in joined}
 
 
 def _most_attempts(task: Task) -> int:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Progress, Vector, compute_once
+from softneck.core import DataError, Progress, Vector, compute_once, worst
 from softneck.estimation import directions_of
 from softneck.identification import Draws, Model
 from softneck.loop import BlockPart, Loop, LoopResult, MotorFault, RobotReference, error_unit, run_loop
@@ -80,13 +80,17 @@ class Drawn:
         """Share of such plants that holds with 95 % confidence; 0 if a draw fails."""
         return 0.0 if self.failed else certified_content(self.count, self.attempt)
 
-    def worst(self, metric: str, *, largest: bool) -> Model | None:
-        """Return the draw with the worst value of a metric; None if no loop tells it."""
+    def worst(self, metric: str, *, largest: bool) -> int | None:
+        """Return the number of the draw with the worst value of a metric; None if no loop tells it."""
         if metric not in self.values:
             return None
         values = np.nan_to_num(self.values[metric], nan=math.inf if largest else -math.inf)
         row = int(np.argmax(values) if largest else np.argmin(values))
-        return _models(self.draws, self.attempt)[self.conditions[metric][row]["draw"]]
+        return self.conditions[metric][row]["draw"]
+
+    def model(self, number: int) -> Model:
+        """Return a draw."""
+        return _models(self.draws, self.attempt)[number]
 
     def statement(self) -> str:
         """Return what the loops over the draws say."""
@@ -290,7 +294,9 @@ def _step(task: _Task, plant: SimulationModel, number: int, kg: float, orientati
     names = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "slack_s")
     rows = 0 if result is None else round((at + half) / result.sample_time)
     values = step_metrics(None if result is None else without_lead(rows_of(result, 0, rows), loop.reference))
-    found = {f"sim.{name_of(name)}": values[name] for name in names if not math.isnan(values[name])}
+    # Without tension outputs there is no slack to know; anything else that is no number fails.
+    known = [name for name in names if name != "slack_s" or not math.isnan(values[name])]
+    found = {f"sim.{name_of(name)}": values[name] for name in known}
     if _has_load(task):
         found[f"sim.{name_of('load_rms_deg')}"] = math.inf if result is None else _load_rms(result, rows, asked)
     return found
@@ -325,7 +331,7 @@ def _load_rms(result: LoopResult, first: int, asked: Requirements) -> float:
         float(np.sqrt(np.mean((result[name][first:] - result[f"{name}_reference"][first:]) ** 2)))
         for name in result.robot.outputs.names
     ]
-    return float(asked.scale.shown(max(errors)))
+    return float(asked.scale.shown(worst("load_rms", errors)))
 
 
 def _margins(task: _Task, number: int) -> list[_Margin]:
@@ -423,20 +429,20 @@ def _unreached(draws: Draws, asked: Requirements) -> dict[str, str]:
     """Return "sim" -> why the recordings do not reach the steps, and what to record."""
     size, most = asked.scale.si(float(asked.sim["size_deg"])), min(draws.conditions["motion"])
     shown, unit = asked.scale.shown, error_unit(asked.robot)[0]
-    found: dict[str, str] = {}
+    found = []
     if size > _BEYOND * most:
-        found["sim"] = (
-            f"not supported by the data: steps of {shown(size):.3g} {unit}, the recordings move {shown(most):.3g} "
+        found.append(
+            f"steps of {shown(size):.3g} {unit}, the recordings move {shown(most):.3g} "
             f"{unit}; record larger motions (`softneck record eq22`, or `multisine` with a larger --amplitude), or set "
             f"`[sim] {asked.scale.name_of('size_deg')}`"
         )
     heavy = max(draws.conditions["payload_kg"])
     if asked.own.get("sim", {}).get("payloads_kg") and max(asked.sim["payloads_kg"]) > heavy + 1e-9:
-        found["sim"] = (
-            f"not supported by the data: a payload of {max(asked.sim['payloads_kg']):g} kg, recorded up to {heavy:g} "
+        found.append(
+            f"a payload of {max(asked.sim['payloads_kg']):g} kg, recorded up to {heavy:g} "
             f"kg; record with it (`softneck record eq22 --payload {max(asked.sim['payloads_kg']):g}`)"
         )
-    return found
+    return {"sim": f"not supported by the data: {'; '.join(found)}"} if found else {}
 
 
 def draws_of(families: Mapping[str, Any]) -> dict[str, Draws]:

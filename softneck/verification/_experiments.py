@@ -272,6 +272,8 @@ class Experiment:
             return 0.0, math.inf
         rows = round(_WINDOW_S * self.loop.time / result.sample_time)
         angles = np.stack([result[name] for name in self.loop.outputs])
+        if not np.isfinite(angles).all():
+            return 0.0, math.inf  # an output that a plant did not tell is not calm
         kicked = angles[:, result.time >= self.loop.time * REST_S]
         if (gain, delay) == (1.0, 0.0) and np.ptp(kicked, axis=1).max() <= _RESPONSE_SHARE * self.amplitude:
             return 0.0, math.inf  # no response, such as with motors at their limits: no margin can be found

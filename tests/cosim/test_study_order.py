@@ -142,6 +142,26 @@ def test_a_run_that_is_on_the_disk_twice_counts_once(tmp_path: Path) -> None:
     assert table[ERROR].tolist() == [10.0, 11.0, 12.0]
 
 
+def test_files_of_a_study_never_grow_beyond_their_number_and_lose_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_store, "_MERGE_AT", 4)
+    made = make_study({"duration_s": 1.0, "plant": {"neck": "paper"}}, vary={"reference.at_s": [0.1, 0.2]}, runs=2)
+    store = Store(made, tmp_path)
+    row = {"sample": 0, "seed": 0, "reference.at_s": 0.1, "holds": True, "error": ""}
+    for run in range(11):
+        store.add([{"run": run, **row}])
+        assert len(list((tmp_path / "runs.parts").glob("*.csv"))) <= 4
+        assert store.frame()["run"].tolist() == list(range(run + 1))
+        assert store.done == set(range(run + 1))
+    # A study that goes on counts the files that are there.
+    again = Store(made, tmp_path)
+    again.add([{"run": 11, **row}])
+    assert len(list((tmp_path / "runs.parts").glob("*.csv"))) <= 4
+    assert again.finish()["run"].tolist() == list(range(12))
+    assert not (tmp_path / "runs.parts").exists()
+
+
 def test_groups_keep_their_own_runs() -> None:
     runs = runs_of((1.0, 5.0, 2.0, 7.0))
     runs["kind"] = ["a", "b", "a", "b"]

@@ -178,6 +178,29 @@ def test_margins_that_the_data_support_count_where_they_are_worse(monkeypatch: p
     assert none["mimo.disk_margin"] == 0.0
 
 
+@pytest.mark.parametrize("drawn", [(), ("f, draw 1",)])
+@pytest.mark.parametrize("extra", [0, 2])
+def test_linear_checks_are_of_plants_as_late_as_the_loop_and_of_the_data_where_no_draws_decide(
+    extra: int, drawn: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A delay that the loop's order adds takes phase: without it each margin would be too good."""
+    plants = SimpleNamespace(later=lambda samples: SimpleNamespace(axes=AXES, samples=samples))
+    one = SimpleNamespace(laws={"": "law"}, extra=extra, block="block")
+    asked: list[Any] = []
+    monkeypatch.setattr(_judge, "controller_under_test", lambda *_, **__: one)
+    monkeypatch.setattr(_judge, "margins", lambda *given: asked.append(given) or {})
+    monkeypatch.setattr(_judge, "data_margins", lambda *given: asked.append(given) or [])
+    monkeypatch.setattr(_judge, "run_steps", lambda *given, **_: asked.append(given) or SimpleNamespace(metrics={}))
+    task = _task()
+    task.drawn, task.linear = drawn, {"f": 1}
+    assert linear_metrics(task, SimpleNamespace(plants=plants, weights=None), None) == {}  # pyright: ignore[reportArgumentType]
+    by_data = [] if drawn else [({"f": 1}, "law", AXES, extra, -1.0)]
+    assert [given for given in asked if given[0] == {"f": 1}] == by_data
+    linear = [given for given in asked if given[0] != {"f": 1}]
+    assert [given[0].samples for given in linear] == [extra, extra]
+    assert [given[1] for given in linear] == ["law", "block"]
+
+
 @pytest.mark.parametrize("name", ["axes.gain_margin", "axes.delay_margin_ms"])
 def test_a_margin_by_experiment_is_the_smallest_of_all_loops(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     task = _task()
@@ -559,7 +582,9 @@ def test_curves_are_of_the_plain_steps_from_the_lowest_to_the_highest(monkeypatc
 
     monkeypatch.setattr(_judge, "run_loop", overflow)
     assert curves(every) == {}
+    # One number that is none leaves no curve at all.
     assert _judge._finite_curves({"a": np.array([1.0, math.nan])}) == {}
+    assert _judge._finite_curves({"a": np.array([1.0]), "b": np.array([math.nan])}) == {}
     assert _judge._finite_curves({"a": np.array([math.inf])}) == {}
     assert _judge._finite_curves({"a": np.array([1.23456])}) == {"a": [1.235]}
 
@@ -999,9 +1024,9 @@ def resumable(monkeypatch: pytest.MonkeyPatch, values: dict[str, float], *, foun
 
     Returns what `_certify_search` does, and the attempts.
     """
-    low, high = SimpleNamespace(arrays=[1]), SimpleNamespace(arrays=[2])
-    # Of a large rise and overshoot one draw is the worst, of a small margin another.
-    part = SimpleNamespace(family="f", attempt=0, worst=lambda _, largest: high if largest else low)
+    # Of a large rise and overshoot one draw is the worst, of a small margin another; each is made anew when asked for.
+    part = SimpleNamespace(family="f", attempt=0, worst=lambda _, largest: 2 if largest else 1,
+                           model=lambda number: SimpleNamespace(arrays=[number]))  # fmt: skip
     failed = [Verdict(bound, 9.0 if bound.bound == "max" else 1.7, False, {}) for bound in LIMITS]
     asked = SimpleNamespace(bounds=LIMITS, stated=frozenset(["sim.overshoot_pct"]), kept={"axes.gain_margin": 0.2})
 
@@ -1080,6 +1105,25 @@ def test_what_no_loop_over_draws_tells_resumes_no_search(monkeypatch: pytest.Mon
         search, (again, certified, tried), verified = resumable(monkeypatch, values, found=True, holds=holds)
         assert again is search
         assert (tried, certified.verification.holds) == (verified[-1], holds == 1)
+
+
+def test_at_most_three_draws_join_each_once_though_it_is_the_worst_in_several_metrics() -> None:
+    def part(family: str, *worst: int | None) -> Any:
+        told = dict(zip("abc", worst, strict=True))
+        return SimpleNamespace(family=family, attempt=2, worst=lambda metric, **_: told[metric],
+                               model=lambda number: [family, number])  # fmt: skip
+
+    failed: Any = [SimpleNamespace(requirement=Requirement(metric, "max", 1.0, False)) for metric in "abc"]
+    found = _tune._failing_draws([part("f", 4, 4, None), part("g", 4, 0, 4)], failed)
+    assert found == {"f, attempt 2, a": ["f", 4], "g, attempt 2, a": ["g", 4], "g, attempt 2, b": ["g", 0]}
+    many = _tune._failing_draws([part("f", 4, 3, 2), part("g", 1, 0, 4)], failed)
+    assert list(many.values()) == [["f", 4], ["f", 3], ["f", 2]]
+    # Of a margin the smallest is the worst, of all else the largest.
+    sides: list[bool] = []
+    asked: Any = [SimpleNamespace(requirement=Requirement("a", bound, 1.0, False)) for bound in ("min", "max", "below")]
+    one: Any = SimpleNamespace(family="f", attempt=1, worst=lambda _, largest: sides.append(largest))
+    assert _tune._failing_draws([one], asked) == {}
+    assert sides == [False, True, True]
 
 
 @pytest.mark.parametrize("found", [True, False])

@@ -199,9 +199,10 @@ def test_the_worst_draw_of_a_metric_is_that_of_its_attempt() -> None:
     values = {"m": np.array([1.0, 3.0, 2.0, 3.0]), "n": np.array([1.0, math.nan, -math.inf, 0.0])}
     numbers = [{"draw": k} for k in (0, 2, 1, 0)]
     found = Drawn("f", draws, 4, 3, values, dict.fromkeys("mn", numbers), ())  # pyright: ignore[reportArgumentType]
-    assert [found.worst("m", largest=True), found.worst("m", largest=False)] == ["attempt 4, 2", "attempt 4, 0"]
+    assert [found.worst("m", largest=True), found.worst("m", largest=False)] == [2, 0]
+    assert found.model(2) == "attempt 4, 2"
     # A value that is no number is the worst of both.
-    assert found.worst("n", largest=True) == found.worst("n", largest=False) == "attempt 4, 2"
+    assert found.worst("n", largest=True) == found.worst("n", largest=False) == 2
     assert found.worst("k", largest=True) is None
 
 
@@ -211,6 +212,7 @@ def test_the_worst_draw_of_a_metric_is_that_of_its_attempt() -> None:
         ({"size_deg": 11.0}, 10.0, 0.5, ""), ({"size_deg": 11.01}, 10.0, 0.5, "steps of 11 deg, the recordings move"),
         ({"payloads_kg": [0.0, 0.5]}, 45.0, 0.5, ""), ({}, 45.0, 0.0, ""),
         ({"payloads_kg": [0.6, 0.0]}, 45.0, 0.5, "a payload of 0.6 kg, recorded up to 0.5 kg"),
+        ({"size_deg": 11.01, "payloads_kg": [0.6]}, 10.0, 0.5, "--payload 0.6"),
     ],
 )  # fmt: skip
 def test_conditions_beyond_the_recordings_are_told(
@@ -220,6 +222,8 @@ def test_conditions_beyond_the_recordings_are_told(
     found = _drawn._unreached(draws, make_requirements({"sim": changes}))
     assert set(found) == ({"sim"} if told else set())
     assert told in found.get("sim", "")
+    # Of two conditions each is told.
+    assert ("steps of 11 deg" in found.get("sim", "")) is (changes.get("size_deg") == 11.01)
 
 
 def test_a_draw_carries_the_lightest_and_the_heaviest_payload() -> None:
@@ -242,8 +246,11 @@ def test_the_error_under_the_load_is_the_worse_output_s_from_the_load_on() -> No
         result = result_of(pitch=pitch, roll=roll, pitch_reference=[0.0] * 4, roll_reference=[0.0] * 4)
         # rms of 0.5 and 0.7; sums are rounded.
         assert _drawn._load_rms(result, 2, asked) == pytest.approx(math.degrees(math.sqrt(0.37)), rel=1e-12)
-    lost = result_of(pitch=[0.0, math.nan], roll=[0.0, 0.0], pitch_reference=[0.0] * 2, roll_reference=[0.0] * 2)
-    assert math.isnan(_drawn._load_rms(lost, 1, asked))
+    for names in (("pitch", "roll"), ("roll", "pitch")):
+        one, other = names
+        references = dict.fromkeys(("pitch_reference", "roll_reference"), [0.0] * 2)
+        lost = result_of(**{one: [0.0, math.nan], other: [0.0, 0.0], **references})
+        assert _drawn._load_rms(lost, 1, asked) == math.inf
 
 
 def test_outputs_of_a_draw_are_those_that_its_sensor_tells() -> None:
@@ -312,8 +319,13 @@ def test_a_step_of_a_draw_has_its_disturbance_and_then_its_load(
     assert (found["sim.rise_s"], found["sim.steady_rms_deg"]) == (0.0, pytest.approx(0.0, abs=1e-12))
     if load:
         assert found["sim.load_rms_deg"] == pytest.approx(math.degrees(0.01), rel=1e-9)
-    # The plant tells no tensions, so nothing is said of slack.
-    assert "sim.slack_s" not in found
+    # The plant tells no tensions, so nothing is said of slack; no other metric vanishes where it is no number.
+    names = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "slack_s")
+    assert set(found) - {"sim.load_rms_deg"} == {f"sim.{name}" for name in names[:-1]}
+    monkeypatch.setattr(_drawn, "step_metrics", lambda _: dict.fromkeys(names, math.nan))
+    lost = _drawn._step(task, plant, 4, 0.3, math.radians(angle))
+    assert lost.keys() == found.keys()
+    assert math.isnan(lost["sim.rise_s"])
 
 
 @pytest.mark.parametrize(

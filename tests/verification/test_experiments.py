@@ -323,6 +323,10 @@ def test_the_last_two_windows_of_an_experiment_are_compared_over_all_outputs(
     told[0] = dict.fromkeys(("pitch", "roll"), np.zeros(time.size))
     assert made._windows(1.0, 0.0) == (0.0, math.inf)
     assert made._windows(1.0, 1.0) == made._windows(1.1, 0.0) == (0.0, 0.0)
+    # An output that was not told at one row, of whichever axis, is no calm one.
+    for axis in outputs:
+        told[0] = both | {axis: np.where(np.arange(time.size) == time.size - rows, math.nan, both[axis])}
+        assert made._windows(2.0, 0.0) == (0.0, math.inf)
 
 
 @pytest.mark.parametrize(("what", "share"), [("gain_up", 0.1), ("delay", 0.1), ("gain_down", _AUDIBLE_SHARE_DOWN)])
