@@ -115,15 +115,18 @@ def _why(found: tuning.Tuned, folder: Path) -> str:
     unknown = [item.note for item in failed if item.value is None]
     blind = verification.ALONE in binds or any("no linear form" in note for note in unknown)
     unheard = any(note.startswith("not supported by the data") for note in binds)
-    way = way_on(found.binding, unheard=unheard, blind=blind, unknown=bool(unknown))
+    drawn = found.verification.evidence.drawn
+    doubt = next((part.draws.doubt for part in drawn if part.failed and part.draws.doubt), "")
+    way = way_on(found.binding, unheard=unheard, blind=blind, unknown=bool(unknown), doubt=doubt)
     return f"{folder}: the best so far does not keep all requirements. {failing_requirement(found)} {way}."
 
 
-def way_on(binding: str | None, *, unheard: bool, blind: bool = False, unknown: bool = False) -> str:
+def way_on(binding: str | None, *, unheard: bool, blind: bool = False, unknown: bool = False, doubt: str = "") -> str:
     """Return the advice on the active requirement.
 
     `binding`: the active requirement; None if it is not known. `unheard`: whether the data do not support it. `blind`:
     whether the kind has no linear form to test against the data. `unknown`: whether something else was not computed.
+    `doubt`: why the draws that fail decide little.
     """
     from softneck.verification import MARGIN_GROUPS
 
@@ -131,6 +134,11 @@ def way_on(binding: str | None, *, unheard: bool, blind: bool = False, unknown: 
         return "No setting fixes it: name kinds with a linear form in --kinds, such as pi or lqg"
     if unknown:
         return "No setting of a controller fixes it: give what is missing, or leave the requirement out"
+    if doubt:
+        return (
+            f"The family's draws decide little, as {doubt}: record more, longer and to other heights, and give the "
+            "family all recordings"
+        )
     if binding is None:
         return "Continue with a larger --budget"
     if unheard:

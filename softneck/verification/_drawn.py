@@ -95,7 +95,8 @@ class Drawn:
     def statement(self) -> str:
         """Return what the loops over the draws say."""
         if self.failed:
-            return f"{len(self.failed)} of {self.count} draws of {self.family} fail"
+            doubt = f", but {self.draws.doubt}" if self.draws.doubt else ""
+            return f"{len(self.failed)} of {self.count} draws of {self.family} fail{doubt}"
         tries = "" if self.attempt == 1 else f" (attempt {self.attempt}, which is counted)"
         return (
             f"none of {self.count} draws of {self.family} fails: {100.0 * self.content:.1f} % of such plants hold, "

@@ -152,6 +152,15 @@ def test_no_certificate_where_the_loops_of_tuning_alone_do_not_hold(
     assert not (tmp_path / "out" / "best.certificate.json").exists()
 
 
+@pytest.mark.parametrize("binding", ["sim.rise_s", "axes.gain_margin", None])
+def test_draws_that_decide_little_ask_for_a_recording(binding: str | None) -> None:
+    way = way_on(binding, unheard=False, doubt="they cover 79 % of middle motions, not 95 %")
+    assert "79 % of middle motions" in way
+    assert "record more" in way
+    assert "oosen" not in way
+    assert "budget" not in way
+
+
 def test_nobody_is_told_to_loosen_a_margin() -> None:
     assert "Loosen it" in way_on("sim.rise_s", unheard=False)
     for margin in ("axes.gain_margin", "mimo.disk_margin", "robust.mu", "stability.radius"):

@@ -143,8 +143,8 @@ def test_the_attempt_that_tune_certified_counts_for_its_controller(tmp_path: Pat
 
 def told_draws(**more: Any) -> Any:
     conditions = {"motion": [0.1, 0.4], "payload_kg": [0.0, 0.5], **more}
-    return SimpleNamespace(seed=7, model=SimpleNamespace(kind="play"), coverage=[1], level=0.9, conditions=conditions,
-                           share=np.array([0.01, 0.02]), keep=0.9)  # fmt: skip
+    return SimpleNamespace(seed=7, doubt="", model=SimpleNamespace(kind="play"), coverage=[1], level=0.9,
+                           conditions=conditions, share=np.array([0.01, 0.02]), keep=0.9)  # fmt: skip
 
 
 def test_draws_say_how_many_hold_at_which_attempt() -> None:
@@ -157,6 +157,8 @@ def test_draws_say_how_many_hold_at_which_attempt() -> None:
     assert drawn(attempt=2).statement().endswith("(attempt 2, which is counted)")
     bad = drawn((1, 4))
     assert (bad.content, bad.statement()) == (0.0, "2 of 59 draws of f fail")
+    doubted = replace(bad, draws=SimpleNamespace(doubt="they differ"))  # pyright: ignore[reportArgumentType]
+    assert doubted.statement() == "2 of 59 draws of f fail, but they differ"
     assert bad.facts() == {
         "family": "f", "count": 59, "failed": [1, 4], "attempt": 1, "content": 0.0, "confidence": 0.95, "seed": 7,
         "kind": "play", "coverage": [1], "level": 0.9, "statement": "2 of 59 draws of f fail",

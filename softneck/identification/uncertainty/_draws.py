@@ -52,6 +52,8 @@ _DEVIATIONS = 1.96
 _MEMORIES_S = np.geomspace(0.01, 10.0, 31)
 # Share of what is left over that is disturbance at least, where the sensor's noise explains all of it.
 _LEAST_DISTURBANCE = 0.05
+# Width of the band, as a share of large motions, beyond which hardly a loop can hold for all draws.
+_WIDE = 0.25
 # Classes of amplitude, by the share of the largest motion of the segments.
 _CLASSES = (("small", 0.0, 0.25), ("middle", 0.25, 0.6), ("large", 0.6, math.inf))
 
@@ -123,6 +125,17 @@ class Draws(ReprMixin):
         own = {name: values[number] for name, values in self.arrays.items()}
         return replace(self.model, arrays={**self.model.arrays, **own})
 
+    @property
+    def doubt(self) -> str:
+        """What of the draws is too little to decide by; empty where they cover the held-out motions and are close."""
+        low = next((row for row in self.coverage if row["covered"] < self.level), None)
+        if low is not None:
+            covered, wanted = 100.0 * low["covered"], 100.0 * self.level
+            return f"they cover {covered:.3g} % of {low['class']} motions, not {wanted:.3g} %"
+        large = self.coverage[-1]
+        wide = large["width"] / max(large["motion"], 1e-300)
+        return f"they differ by +-{100.0 * wide:.0f} % of {large['class']} motions" if wide > _WIDE else ""
+
     def summary(self, shown: float, unit: str) -> list[str]:
         """Return lines on the draws; `shown` converts outputs from SI to `unit`."""
         lines = [
@@ -136,7 +149,7 @@ class Draws(ReprMixin):
                 f"{100.0 * row['covered']:.0f} % within +-{shown * row['width']:.2g} {unit}, "
                 f"{100.0 * row['width'] / max(row['motion'], 1e-300):.0f} % of the motion"
             )
-        return lines
+        return [*lines, f"caution: draws decide little, as {self.doubt}; record more"] if self.doubt else lines
 
     def to_archive(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """Return header and arrays."""

@@ -471,6 +471,22 @@ def test_draws_of_one_certificate_are_the_fewest_that_tell_95_percent_with_95_pe
     assert inspect.signature(make_draws).parameters["count"].default == _draws.SEARCH_DRAWS == _draws.DRAWS
 
 
+@pytest.mark.parametrize(
+    ("covered", "width", "words"),
+    [([1.0, 0.95], [9.0, 0.25], ""), ([0.949, 1.0], [0.1, 0.1], "cover 94.9 % of small motions, not 95 %"),
+     ([1.0, 0.9], [0.1, 0.1], "cover 90 % of large"), ([1.0, 1.0], [0.1, 0.26], "+-26 % of large motions")],
+)  # fmt: skip
+def test_draws_that_cover_too_little_or_differ_too_much_are_doubted(
+    made: Callable[..., Draws], covered: list[float], width: list[float], words: str
+) -> None:
+    """Small motions may differ by a multiple: friction is there."""
+    rows = [{"class": name, "motion": 1.0, "covered": own, "width": wide, "segments": 1}
+            for name, own, wide in zip(("small", "large"), covered, width, strict=True)]  # fmt: skip
+    found = replace(made(), coverage=rows)
+    assert (words in found.doubt) if words else (found.doubt == "")
+    assert any("record more" in line for line in found.summary(1.0, "rad")) == bool(words)
+
+
 def test_the_variance_of_a_disturbance_follows_its_recursion() -> None:
     moves, keep = np.array([[1.0], [0.0], [2.0], [0.0]]), 0.5
     # v[k] = keep^2 v[k-1] + dy[k]^2
