@@ -64,8 +64,8 @@ class Candidate:
 
     def update(self, level: str, judgement: Judgement) -> None:
         """Add the judgement of a level."""
-        self.error = judgement.error or self.error
         if judgement.error:
+            self.error = judgement.error
             return
         self.level = level
         self.curves = judgement.curves or self.curves
@@ -234,8 +234,8 @@ class Search:
         for _ in range(_START_STEPS):
             for kind, k in led.items():
                 x = at[kind].x.copy()
-                # A failed design gets a larger bound.
-                x[k] += step if at[kind].error or self._is_robust(at[kind]) else -step
+                # A failed design, of which no margin is known, gets a larger bound.
+                x[k] += step if self._is_robust(at[kind]) else -step
                 at[kind] = self._candidate(spaces[kind], np.clip(x, 0.0, 1.0))
             self._judge([at[kind] for kind in led], LEVELS[0], reserved)
             for kind, k in led.items():

@@ -260,9 +260,11 @@ def test_a_final_candidate_is_judged_on_its_own_plants_and_on_all_draws_of_each_
 
     monkeypatch.setattr(_judge, "run_drawn", run)
     monkeypatch.setattr(_judge, "loops_under_test", lambda _, own, *__, **___: [plant.name for plant in own])
-    monkeypatch.setattr(_judge, "crossings", lambda loops, **_: loops)
+    tried: list[Any] = []
+    monkeypatch.setattr(_judge, "crossings", lambda loops, **_: tried.extend(loops) or loops)
     monkeypatch.setattr(_judge, "crossing_values", lambda loops: {"axes.gain_margin": ([9.0] * len(loops), loops)})
     found = margin_metrics(task, SimpleNamespace(own=plants), "block", "parallel", "eyes")  # pyright: ignore[reportArgumentType]
+    assert tried == ["mine"]
     # Attempt 0: no draw of a certificate is seen. The draws that lead the search are among them.
     assert asked == [(f, f.upper(), "block", "parallel", "eyes", 0) for f in "fg"]
     assert found == {"axes.gain_margin": 9.0, name: 1.0 if metric_of(name).larger else 4.0}
@@ -828,6 +830,99 @@ def test_where_draws_decide_a_kind_begins_at_the_better_of_its_limits_and_of_a_d
     assert detuned["reference_time"][1] < pi.settings(pi.start)["reference_time"][1]
     # At the end of the ranges nothing is detuned.
     np.testing.assert_array_equal(mpc.detuned(0.0 * mpc.start), 0.0 * mpc.start)
+
+
+def test_of_two_starts_that_are_alike_the_one_at_its_limits_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = searching("ab", drawn=("d",))
+    search.spaces = list(spaces(("pi", "mpc"), rise=0.5, cocontraction=None, robot=Robot.preset()))
+
+    def judge(_: Any, items: Any, level: str, __: int) -> None:
+        for item in items:
+            item.level, item.metrics = level, {"m": 0.5, "axes.sensitivity": 1.0}
+
+    monkeypatch.setattr(Search, "_judge", judge)
+    starts = {space.kind: search._candidate(space, space.start) for space in search.spaces}
+    judge(None, starts.values(), LEVELS[1], 0)
+    assert search._judge_detuned(starts, LEVELS[:2], 0) == starts
+    for item in starts.values():
+        item.metrics = {"m": 0.6, "axes.sensitivity": 1.0}
+    # One that was judged less far is not taken for its cost.
+    assert search._judge_detuned(starts, LEVELS[:1], 0) == starts
+    assert all(found is not starts[kind] for kind, found in search._judge_detuned(starts, LEVELS[:2], 0).items())
+
+
+@pytest.mark.parametrize("told", ["no margins", "margins that hold", "margins that fail", "no design"])
+def test_a_start_follows_its_margins_to_a_larger_bound_and_stays_where_it_has_none(
+    told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = searching("a")
+    search.spaces = list(spaces(("pi",), rise=0.5, cocontraction=None, robot=Robot.preset()))
+    (space,) = search.spaces
+    bound = Requirement("axes.gain_margin", "min", 2.0, True)
+    search.task.bounds = (bound,)  # pyright: ignore[reportAttributeAccessIssue]
+    search.task.aims = (replace(bound, limit=4.0),)  # pyright: ignore[reportAttributeAccessIssue] - of what is asked
+    known = (
+        {} if told == "no margins" else {"axes.sensitivity": 1.5, "axes.gain_margin": 3.0 if "hold" in told else 1.5}
+    )
+
+    def judge(_: Any, items: Any, level: str, __: int) -> None:
+        for item in items:
+            if told == "no design":
+                item.error = "too slow"
+            else:
+                item.level, item.metrics = level, known
+
+    monkeypatch.setattr(Search, "_judge", judge)
+    start = search._candidate(space, space.start)
+    judge(None, [start], LEVELS[0], 0)
+    moved = search._move_starts({"pi": start}, 0)["pi"]
+    k, step = space.trade_off or 0, _search._START_STEP
+    if told in ("no margins", "no design"):
+        assert moved is start
+        # Of what cannot be designed a larger bound is tried, of what has no margins to follow none.
+        tried = sorted(item.x[k] for item in search.candidates.values() if item is not start)
+        assert tried == ([] if told == "no margins" else pytest.approx(
+            np.minimum(start.x[k] + step * np.array([1.0, 1.5, 1.75]), 1.0)))  # fmt: skip
+        return
+    sign = 1.0 if "hold" in told else -1.0
+    assert moved.x[k] == pytest.approx(np.clip(start.x[k] + sign * 1.75 * step, 0.0, 1.0))
+    np.testing.assert_array_equal(np.delete(moved.x, k), np.delete(start.x, k))
+
+
+def test_a_search_is_led_by_what_it_aims_at_and_its_finals_are_of_each_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    closer = (Requirement("m", "max", 0.5, True),)
+    search, judged = searching("ab", own={"p": 1}), list[Any]()
+    search.task.aims = closer  # pyright: ignore[reportAttributeAccessIssue]
+    item = of_kind("a", 0.75)
+    assert search.cost(item) == item.cost(closer, tested=False) > 1.0 > item.cost(search.task.bounds, tested=False)
+    # Four of the better kind, and one of another that is left out of none.
+    for number, (kind, value) in enumerate([("a", 0.1), ("a", 0.2), ("a", 0.3), ("b", 0.4)]):
+        search.candidates[kind, str(number)] = of_kind(kind, value, number=number)
+    search.candidates["a", "low"] = of_kind("a", 0.0, "linear")
+    monkeypatch.setattr(Search, "_refine", lambda *_: None)
+    monkeypatch.setattr(Search, "_judge", lambda _, items, level, left: judged.append((items, level, left)))
+    search._finish(2)
+    [(items, level, left)] = judged
+    assert ([each.metrics["m"] for each in items], level, left) == ([0.1, 0.4], "margins", 0)
+
+
+@pytest.mark.parametrize("tested", [True, False])
+@pytest.mark.parametrize("asked", [True, False])
+@pytest.mark.parametrize(
+    ("value", "ratio"), [(None, math.inf), (4.0, 1.0), (2.0, 1.0), (1.0, 2.0), (math.nan, math.inf)]
+)
+def test_a_margin_by_experiment_alone_earns_nothing_and_is_none_beside_recordings_or_if_stated(
+    value: float | None, ratio: float, tested: bool, asked: bool
+) -> None:
+    bounds = (Requirement("axes.gain_margin", "min", 2.0, asked), Requirement("sim.rise_s", "max", 1.0, asked))
+    metrics = {"sim.rise_s": 0.5} | ({} if value is None else {"axes.gain_margin": value})
+    found = Candidate("adaptive", {}, np.zeros(1), "all", metrics).ratios(bounds, tested=tested)
+    assert found == {"axes.gain_margin": math.inf if tested or asked else ratio, "sim.rise_s": 0.5}
+    # One with a linear form has the ratio of its margin, and one that was not judged none at all.
+    seen = Candidate("pi", {}, np.zeros(1), "all", metrics | {"axes.sensitivity": 1.0}).ratios(bounds, tested=tested)
+    margins = {} if value is None else {"axes.gain_margin": math.inf if math.isnan(value) else 2.0 / value}
+    assert seen == {"sim.rise_s": 0.5, **margins}
+    assert Candidate("pi", {}, np.zeros(1)).ratios(bounds, tested=tested) == {}
 
 
 @pytest.mark.parametrize("own", [True, False])
