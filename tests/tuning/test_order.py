@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -761,6 +762,7 @@ def test_a_costly_kind_goes_on_only_as_the_best() -> None:
         ([2.0, 3.0, 4.0, 5.0], 2),
         ([2.0, 3.0, 4.0], 2),
         ([0.5, 2.0, 3.0, 4.0, 5.0], 3),
+        ([1.0, 1.0, 1.0, 1.0, 2.0], 4),
         ([], 0),
     ],
 )
@@ -771,6 +773,44 @@ def test_what_holds_goes_on_and_at_least_the_better_half(values: list[float], ke
     found = search._select([*others, *items[::-1], *items], "all")
     assert {id(item) for item in found} == {id(item) for item in items[:kept]}
     assert len(found) == kept
+
+
+def test_what_is_left_of_a_level_is_judged_at_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    search, said = searching("a"), list[Any]()
+    monkeypatch.setattr(Search, "_judge", lambda _, items, level, finals: said.append((level, list(items), finals)))
+    monkeypatch.setattr(Search, "_select", lambda _, items, __: items[1:])
+    search._judge_levels([1, 2, 3], LEVELS, 5)  # pyright: ignore[reportArgumentType]
+    assert said == [("linear", [1, 2, 3], 5), ("all", [2, 3], 5), ("margins", [3], 5)]
+
+
+@pytest.mark.parametrize("left", [0, 1, 2, 9])
+def test_nothing_is_judged_twice_nor_after_an_error_nor_beyond_the_budget(
+    left: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the six one has an error, one was judged at this level, one twice and one in an earlier process."""
+    found: dict[Job, Judgement] = {}
+    search, run = searching("a", budget=left + 4), list[str]()
+    writes: list[int] = []
+    search.log = SimpleNamespace(found=found, write=lambda: writes.append(len(found)))  # pyright: ignore[reportAttributeAccessIssue]
+    items = {name: Candidate("a", {"k": name}, np.zeros(1)) for name in "abcdef"}
+    items["b"].error, items["c"].level = "no design", "all"
+    jobs = {name: Job.of("a", item.settings, "all") for name, item in items.items()}
+    search.spent = {jobs["e"]}
+    found[jobs["f"]] = Judgement({"m": 0.7})
+
+    def judge(wanted: Any, submit: Any, crew: Any, took: Any) -> None:
+        for job in wanted:
+            run.append(json.loads(job.settings)["k"])
+            took(job, Judgement({"m": 0.5}))
+
+    monkeypatch.setattr(_search, "run_jobs", judge)
+    search._judge([items[name] for name in "abcaefd"], "all", 3)
+    # What a log tells is not run, but it is counted; the rest is kept for later.
+    assert run == [name for name in "afd"[:left] if name != "f"]
+    assert writes == [2 + k for k in range(len(run))]  # each is on the disk as soon as it is known
+    assert search.spent == {jobs["e"], *(jobs[name] for name in "afd"[:left])}
+    assert {name for name, item in items.items() if item.metrics} == set("afd"[:left])
+    assert all(items[name].level == "all" for name in "afd"[:left])
 
 
 def test_a_search_goes_on_from_the_moved_start_of_a_kind_and_from_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -851,7 +891,7 @@ def test_of_two_starts_that_are_alike_the_one_at_its_limits_is_kept(monkeypatch:
     assert all(found is not starts[kind] for kind, found in search._judge_detuned(starts, LEVELS[:2], 0).items())
 
 
-@pytest.mark.parametrize("told", ["no margins", "margins that hold", "margins that fail", "no design"])
+@pytest.mark.parametrize("told", ["no margins", "margins that hold", "margins that fail", "no design", "later"])
 def test_a_start_follows_its_margins_to_a_larger_bound_and_stays_where_it_has_none(
     told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -867,16 +907,19 @@ def test_a_start_follows_its_margins_to_a_larger_bound_and_stays_where_it_has_no
 
     def judge(_: Any, items: Any, level: str, __: int) -> None:
         for item in items:
-            if told == "no design":
+            if told == "no design" or (told == "later" and item.x[k] < start.x[k] + 1e-9):
                 item.error = "too slow"
             else:
                 item.level, item.metrics = level, known
 
     monkeypatch.setattr(Search, "_judge", judge)
-    start = search._candidate(space, space.start)
+    start, k, step = search._candidate(space, space.start), space.trade_off or 0, _search._START_STEP
     judge(None, [start], LEVELS[0], 0)
     moved = search._move_starts({"pi": start}, 0)["pi"]
-    k, step = space.trade_off or 0, _search._START_STEP
+    if told == "later":  # of what can be designed the smallest bound, as its margins fail
+        assert (moved.error, moved.x[k] > start.x[k]) == ("", True)
+        assert moved.x[k] == min(item.x[k] for item in search.candidates.values() if item.level)
+        return
     if told in ("no margins", "no design"):
         assert moved is start
         # Of what cannot be designed a larger bound is tried, of what has no margins to follow none.
