@@ -23,6 +23,7 @@ def pipelines() -> tuple[Any, Any] | None:
 
     if numba.version_info[:2] != _TESTED:
         return None
+    from llvmlite.binding import Linkage
     from numba import _dynfunc  # pyright: ignore[reportAttributeAccessIssue]
     from numba.core.codegen import JITCodeLibrary
     from numba.core.compiler import CompilerBase, DefaultPassBuilder, _LowerResult
@@ -39,6 +40,15 @@ def pipelines() -> tuple[Any, Any] | None:
                 self._final_module.link_in(library._get_module_for_linking(), preserve=True)
             self._final_module.verify()
             self._finalized = True
+
+    class OuterLibrary(JITCodeLibrary):
+        def _optimize_final_module(self) -> None:
+            # Nobody else calls what is linked in, so LLVM may put a function that is called once in its caller: with up
+            # to 40 arrays as arguments, a call took longer than the equations.
+            for function in self._final_module.functions:
+                if not function.is_declaration and function.linkage == Linkage.linkonce_odr:
+                    function.linkage = "internal"
+            super()._optimize_final_module()
 
     @register_pass(mutates_CFG=True, analysis_only=False)
     class InnerLowering(NativeLowering):
@@ -71,12 +81,15 @@ def pipelines() -> tuple[Any, Any] | None:
             return lower_class
 
         def run_pass(self, state: Any) -> Literal[True]:
+            library: Any = OuterLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+            library.enable_object_caching()
+            state.library = library
             super().run_pass(state)
             # The inner functions got their place in memory now: tell them their environments.
-            for variable in state.library._final_module.global_variables:
+            for variable in library._final_module.global_variables:
                 env = lookup_environment(variable.name) if variable.name.startswith("_ZN08NumbaEnv") else None
                 if env is not None:
-                    state.library.codegen.set_env(variable.name, env)
+                    library.codegen.set_env(variable.name, env)
             return True
 
     def compiler(lowering: Any) -> Any:

@@ -265,3 +265,5 @@ def test_compiled_functions_free_what_they_make_and_hold_what_they_return(
     if _numba_inner.pipelines() is not None:  # with the numba that was tested nothing is counted at all
         text = made.quick.inspect_llvm(made.quick.signatures[0])
         assert "call void @NRT_incref" not in text.split("define ")[1]
+        # And LLVM knows that nobody else calls what is linked in: a function that is called once is put in its caller.
+        assert "define linkonce_odr" not in made.work.inspect_llvm(made.work.signatures[0])
