@@ -7,6 +7,7 @@ import numpy as np
 from softneck.estimation._kalman_parts_runtime import KalmanArrays
 from softneck.estimation._kalman_runtime import KalmanFullState, step
 from softneck.estimation._kalman_runtime import initialise as initialise
+from softneck.estimation._nonlinear_parts_runtime import nonlinear_update, nonlinear_widen
 
 
 def kalman_cost(
@@ -30,25 +31,24 @@ def kalman_cost(
 
 
 def walk_cost(
-    missed: np.ndarray, came: np.ndarray, walked: np.ndarray, noise: float, variance: float, start: int
+    missed: np.ndarray, motion: np.ndarray, walked: np.ndarray, noise: float, timing: np.ndarray, start: int
 ) -> float:
-    """Return sum of m log S + e' e / S over the measured rows (time, m), from row `start` on.
+    """Return sum of log det S + e' S^-1 e over the measured rows (time, m) of `missed`, NaN elsewhere, from `start` on.
 
-    `walked` (time,) is added to the variance before each row, `variance` is the initial one, `noise` the measurement's.
+    `motion` (time, m) of the model in a sample; `walked` (time,) is added to the disturbance's variance before each
+    row; `timing`: its variance at the start, that of the timing error, and what a sample keeps of this.
     """
     m = missed.shape[1]
-    said = np.zeros(m)
+    told, P, none = np.zeros(2 * m), np.zeros((2 * m, 2 * m)), np.zeros(m)
+    for i in range(m):
+        P[i, i] = timing[0]
+        P[m + i, m + i] = timing[1]
     total = 0.0
     for k in range(missed.shape[0]):
-        variance += walked[k]
-        if came[k]:
-            S = variance + noise
-            error = 0.0
-            for i in range(m):
-                e = missed[k, i] - said[i]
-                error += e * e / S
-                said[i] += variance / S * e
+        told[m:] *= timing[2]
+        nonlinear_widen(P, m, walked[k], timing[1], timing[2])
+        if np.isfinite(missed[k]).all():
+            innovation, log_det = nonlinear_update(P, told, motion[k], none, missed[k], noise)
             if k >= start:
-                total += m * math.log(S) + error
-            variance *= noise / S
+                total += log_det + innovation
     return total

@@ -181,22 +181,22 @@ class WalkCost:
 
     def __init__(self, observer: NonlinearObserver, runs: Sequence[Recording]) -> None:
         self._cost = load_functions("softneck.estimation._likelihood_runtime").walk_cost
-        self._start = observer.start**2
-        self._tables: list[tuple[Matrix, np.ndarray, Vector]] = []
+        self._start = observer.walk_start
+        self._tables: list[tuple[Matrix, Matrix, Vector]] = []
         self.outliers = 0
         for run in runs:
             z, spoilt = _measurements_without_outliers(run)
             self.outliers += spoilt
-            angles, fastest = observer.simulate(run)
-            self._tables.append((z - angles, np.asarray(np.isfinite(z).all(axis=1)), fastest))
-        self.rows = sum(int(came[SETTLE:].sum()) for _, came, _ in self._tables)
+            angles, motion, fastest = observer.simulate(run)
+            self._tables.append((z - angles, motion, fastest))
+        self.rows = sum(int(np.isfinite(missed[SETTLE:]).all(axis=1).sum()) for missed, _, _ in self._tables)
 
     def of(self, levels: Vector) -> float:
         """Return the cost as `Cost.of` does."""
         noise, rest, ratio = (float(level) for level in 10.0**levels)
         costs = (
-            self._cost(missed, came, rest**2 + (ratio * fastest) ** 2, noise**2, self._start, SETTLE)
-            for missed, came, fastest in self._tables
+            self._cost(missed, motion, rest**2 + (ratio * fastest) ** 2, noise, self._start, SETTLE)
+            for missed, motion, fastest in self._tables
         )
         return float(sum(costs)) / self.rows
 

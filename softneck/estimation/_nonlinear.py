@@ -1,4 +1,4 @@
-"""The observer over a nonlinear model: its simulation (free run) plus a random-walk disturbance of the outputs."""
+"""The observer over a nonlinear model: its simulation (free run), and what that misses of the outputs."""
 
 from __future__ import annotations
 
@@ -26,17 +26,16 @@ from ._kalman_parts_runtime import KALMAN_LEAD, KALMAN_MORE_LAGS
 from ._nonlinear_parts_runtime import NonlinearArrays
 from ._nonlinear_runtime import NonlinearState
 from ._offline import Estimates, check_recording, filter_recording, run_filter
-from ._payload_runtime import PayloadArrays, PayloadState
 
 _NONLINEAR_RUNTIME = "softneck.estimation._nonlinear_runtime"
-# Over a model that takes the payload as a parameter.
-_PAYLOAD_RUNTIME = "softneck.estimation._payload_runtime"
 FORM = "nonlinear"
 # A model settles within 6 scaled seconds. The recent motion keeps 0.95 of its value in 0.02 scaled seconds: it halves
 # in 0.27, the duration of a step.
 _SETTLING_S, _MOTION_MEMORY, _NOMINAL_PERIOD_S = 6.0, 0.95, 0.02
 # A finite number beyond any set-point: files and C take it.
 _NO_SLEW_LIMIT = 1e12
+# How long a timing error lasts [scaled s]: from 2 to 8 the error changes by 0.5 %.
+_TIMING_MEMORY_S = 4.0
 # Standard deviation of the payload's random walk in a scaled second, as a part of the payload range.
 _PAYLOAD_WALK = 0.1
 _PAYLOAD_PORT = Port(name="payload", unit="kg", description="estimated, within what the model's recordings had")
@@ -47,8 +46,9 @@ _NOISE_DESCRIPTIONS = ("standard deviation", "standard deviation", "of the model
 class NonlinearObserver(ReprMixin):
     """A filter over an identified model of any kind; `KalmanSettings.design` makes it.
 
-    The outputs are the model's simulation from the set-points, plus a random-walk disturbance. Its step has the
-    standard deviation `rest_noise_std` at rest, and `motion_noise_ratio` times the model's recent motion besides.
+    The outputs are the model's simulation from the set-points, earlier or later by a timing error that varies, plus a
+    random-walk disturbance. Its step has the standard deviation `rest_noise_std` at rest, and `motion_noise_ratio`
+    times the model's recent motion besides.
 
     Over a model of several payloads, the payload is a further state with an output of its own.
 
@@ -57,8 +57,9 @@ class NonlinearObserver(ReprMixin):
         noise: standard deviations, named as `noise_names`, in SI.
         constants: see KALMAN_* of `_kalman_parts_runtime`.
         start: initial standard deviation of the disturbance [SI].
+        timing: standard deviation of the timing error [s]; 0 without one, as in files of before.
         slew: (motors,) limit on the rate of set-points [SI/s]; None without a limit.
-        sensor: name of the preset, or the source of its noise: "none" (given), "robot" (its file).
+        sensor: name of the preset, or the source of its noise: "none" (given), "robot" (its file), "recording".
         order: of the loop that it runs in.
         gate_level: chi-square level of the gate.
         delay_source: where the sensor's delay comes from: "given", "sensor", "robot".
@@ -71,6 +72,7 @@ class NonlinearObserver(ReprMixin):
     sensor: str
     order: str
     gate_level: float
+    timing: float = 0.0
     delay_source: str = "given"
     slew: tuple[float, ...] | None = None
     form: str = FORM
@@ -127,7 +129,7 @@ class NonlinearObserver(ReprMixin):
         return Block(
             kind=FORM,
             role="observer",
-            runtime=f"{_PAYLOAD_RUNTIME if payload else _NONLINEAR_RUNTIME}({plant.runtime}:{len(plant.arrays)})",
+            runtime=f"{_NONLINEAR_RUNTIME}({plant.runtime}:{len(plant.arrays)})",
             sample_time=self.sample_time,
             arrays=(*self._own_arrays(plant), *plant.arrays),
             inputs=inputs,
@@ -142,18 +144,21 @@ class NonlinearObserver(ReprMixin):
 
     def _own_arrays(self, plant: Block) -> tuple[Matrix, ...]:
         robot, motors, period = self.robot, len(self.robot.motors.names), self.sample_time
-        scaled = period / (slowest_seconds(self.model) / TIME_CONSTANT)
+        scaled = period / self._second
+        least, most = self.payloads or (0.0, 0.0)
         setup = np.array([
             motors, len(robot.outputs.names), len(plant.outputs),
             max(1, round(_SETTLING_S / scaled)), self.start, _MOTION_MEMORY ** (scaled / _NOMINAL_PERIOD_S),
+            1 if self.payloads is None else 2, self.timing / period, self._timing_kept,
             *(period * most for most in self.slew or (_NO_SLEW_LIMIT,) * motors),
         ])  # fmt: skip
-        arrays = (setup, self.constants, plant.initial_state(use_measurement=0.0).parameters)
-        if self.payloads is None:
-            return arrays
-        least, most = self.payloads
-        walk = _PAYLOAD_WALK * (most - least) * math.sqrt(scaled)
-        return (*arrays, np.array([least, most, walk]))
+        free = plant.initial_state(use_measurement=0.0).parameters
+        return (
+            setup,
+            self.constants,
+            free,
+            np.array([least, most, _PAYLOAD_WALK * (most - least) * math.sqrt(scaled)]),
+        )
 
     def initial_state(self, **parameters: float) -> State:
         """Return the state at the start; parameters are the noise levels by name."""
@@ -169,37 +174,48 @@ class NonlinearObserver(ReprMixin):
         Raises:
             DataError: another sample time or another robot.
         """
-        parts = self._parts
-        return filter_recording(
-            self, recording, parts, lambda x: (x[:, parts["angles"]] + x[:, parts["disturbance"]], self._covariance(x))
-        )
+        return filter_recording(self, recording, self._parts, self._align)
 
-    def simulate(self, run: Recording) -> tuple[Matrix, Vector]:
-        """Return the model's simulation of a run (time, outputs) and its recent motion in a sample (time,).
+    def simulate(self, run: Recording) -> tuple[Matrix, Matrix, Vector]:
+        """Return the model's simulation of a run, its motion in a sample (time, outputs), and that of late (time,).
 
         Raises:
             DataError: another sample time or another robot.
         """
         check_recording(self, run)
         _, states = run_filter(self, run)
-        return states[:, self._parts["angles"]], states[:, self._parts["fastest"]][:, 0]
+        angles, motion, fastest = (states[:, self._parts[name]] for name in ("angles", "motion", "fastest"))
+        return angles, motion, fastest[:, 0]
 
     @cached_property
     def _parts(self) -> dict[str, slice]:
         """Slices of the runtime's state by name."""
-        arrays = self.block().arrays
-        if self.payloads is None:
-            return NonlinearState.parts(NonlinearArrays(arrays))
-        return PayloadState.parts(PayloadArrays(arrays))
+        return NonlinearState.parts(NonlinearArrays(self.block().arrays))
 
-    def _covariance(self, states: Matrix) -> Matrix:
-        """Return the covariance of the outputs at the filter's time (time, outputs, outputs)."""
-        m = len(self.robot.outputs.names)
-        if self.payloads is None:
-            return np.eye(m) * states[:, self._parts["variance"], None]
-        P = states[:, self._parts["P"]].reshape(-1, m + 1, m + 1)
-        G = np.concatenate([np.tile(np.eye(m), (len(P), 1, 1)), states[:, self._parts["slopes"], None]], axis=2)
-        return G @ P @ G.transpose(0, 2, 1)
+    @cached_property
+    def _second(self) -> float:
+        """A scaled second [s]."""
+        return slowest_seconds(self.model) / TIME_CONSTANT
+
+    @property
+    def _timing_kept(self) -> float:
+        """Part of the timing error that a sample keeps."""
+        return math.exp(-self.sample_time / (_TIMING_MEMORY_S * self._second))
+
+    @property
+    def walk_start(self) -> Vector:
+        """Variances at the start of disturbance and timing error [samples^2], and what a sample keeps of the latter."""
+        return np.array([self.start**2, (self.timing / self.sample_time) ** 2, self._timing_kept])
+
+    def _align(self, states: Matrix) -> tuple[Matrix, np.ndarray]:
+        """Return the outputs (time, outputs) at the filter's time, and their covariance (time, outputs, outputs)."""
+        angles, motion, slopes, told, P = (
+            states[:, self._parts[name]] for name in ("angles", "motion", "slopes", "told", "P")
+        )
+        m, one = angles.shape[1], np.eye(angles.shape[1])
+        P = P.reshape(-1, 2 * m + 1, 2 * m + 1)
+        G = np.concatenate([np.tile(one, (len(P), 1, 1)), one * motion[:, None], slopes[:, :, None]], axis=2)
+        return angles + told[:, :m] + motion * told[:, m:], G @ P @ G.transpose(0, 2, 1)
 
     def summary(self) -> str:
         """Return a text of some lines."""
@@ -208,7 +224,8 @@ class NonlinearObserver(ReprMixin):
         lines = [
             f"nonlinear observer over {self.model.kind}, {self.sample_time * 1e3:g} ms, {self.order} order, "
             f"sensor {self.sensor}",
-            "  simulation of the model, and a random-walk disturbance of each output",
+            "  simulation of the model, a random-walk disturbance of each output"
+            + (f", and a timing error of {self.timing * 1e3:.3g} ms" if self.timing else ""),
             f"  noise: measurement {first:.3g} {unit}, disturbance {rest:.3g} {unit} a sample and "
             f"{self.noise[2]:.3g} times the model's motion",
             *gate_and_timing_lines(self.gate_level, self.constants, self.sample_time, self.delay_source),
@@ -224,10 +241,10 @@ class NonlinearObserver(ReprMixin):
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the observer with its model to one `.npz` file."""
         model, arrays = embed_model(self.model)
-        header = {
-            **file_header(self), "start": self.start, **({} if self.slew is None else {"slew": list(self.slew)}),
-            "delay_source": self.delay_source, "model": model,
-        }  # fmt: skip
+        timing = {"timing": self.timing} if self.timing else {}
+        slew = {} if self.slew is None else {"slew": list(self.slew)}
+        own = {"start": self.start, **timing, **slew, "delay_source": self.delay_source}
+        header = {**file_header(self), **own, "model": model}
         write_archive(path, header, {**arrays, "constants": self.constants}, force=force)
 
     @classmethod
@@ -237,10 +254,10 @@ class NonlinearObserver(ReprMixin):
         model = embedded_model(header["model"], arrays)
         if constants.size != KALMAN_MORE_LAGS + max(len(model.robot.outputs.names) - 2, 0):
             raise FileFormatError("its array `constants` has another length; design the observer again.")
-        # Files of earlier versions have no slew limit.
+        # Files of earlier versions have no slew limit and no timing error.
         slew = None if header.get("slew") is None else tuple(float(value) for value in header["slew"])
-        start = float(header["start"])
-        return cls(model=model, constants=constants, start=start, slew=slew, **fields_from_header(header, FORM))
+        own = {"start": float(header["start"]), "timing": float(header.get("timing", 0.0)), "slew": slew}
+        return cls(model=model, constants=constants, **own, **fields_from_header(header, FORM))
 
 
 def is_nonlinear(model: Any) -> bool:

@@ -1,4 +1,10 @@
-"""Shared by observers over nonlinear models: simulation of the model, and the prediction to the present."""
+"""Of the observer over nonlinear models: simulation of the model, its correction, and the prediction to the present.
+
+An output is that of the model, plus a disturbance, plus its motion in a sample times a timing error, plus the slope
+over the payload times the payload's error. These states `told` have the covariance `P`.
+"""
+
+import math
 
 import numpy as np
 
@@ -13,7 +19,14 @@ NONLINEAR_TOLD = 2
 NONLINEAR_SETTLE = 3
 NONLINEAR_START = 4
 NONLINEAR_KEEP = 5
-NONLINEAR_SLEW = 6  # one a motor
+NONLINEAR_COPIES = 6
+NONLINEAR_TIMING = 7
+NONLINEAR_TIMING_KEEP = 8
+NONLINEAR_SLEW = 9  # one a motor
+# Places in `load`.
+PAYLOAD_LEAST = 0
+PAYLOAD_MOST = 1
+PAYLOAD_WALK = 2
 
 
 class NonlinearArrays(Arrays):
@@ -22,13 +35,16 @@ class NonlinearArrays(Arrays):
     setup = array(
         "places",
         "motors, outputs, outputs of the model, samples until it stands, standard deviation of the disturbance at "
-        "the start, part of the fastest motion that a sample keeps, then of each motor the most that its set-point "
+        "the start, part of the fastest motion that a sample keeps, copies of the model, standard deviation of its "
+        "timing error [samples], part of that which a sample keeps, then of each motor the most that its set-point "
         "moves the model in a sample",
     )
     constants = array("numbers", "see KALMAN_*; a lag of 1: the set-points come a sample early")
     free = array("parameters", "of the model in free run")
+    load = array("3", "least and most payload [kg], standard deviation of its walk in a sample [kg]; 0 for one copy")
     motors = value("setup", NONLINEAR_MOTORS)
     outputs = value("setup", NONLINEAR_OUTPUTS)
+    copies = value("setup", NONLINEAR_COPIES)
 
 
 def nonlinear_settle(
@@ -67,29 +83,73 @@ def nonlinear_faster(p: NonlinearArrays, fastest: float, angles: np.ndarray, bef
     return motion
 
 
+def nonlinear_widen(P: np.ndarray, m: int, walked: float, timing: float, keep: float) -> None:
+    """Add a sample's noise: `walked` is the disturbances' variance, `timing` that of a timing error that fades."""
+    for i in range(m):
+        P[i, i] += walked
+        P[m + i] *= keep
+        P[:, m + i] *= keep
+        P[m + i, m + i] += (1.0 - keep * keep) * timing
+
+
+def nonlinear_update(
+    P: np.ndarray, told: np.ndarray, motion: np.ndarray, slopes: np.ndarray, missed: np.ndarray, noise: float
+) -> tuple[float, float]:
+    """Correct `told` (2 m or 2 m + 1,) and `P` by what the model `missed`; return the NIS and log det S.
+
+    The outputs are taken one after the other, which is the same for a white sensor.
+    """
+    m, n = motion.shape[0], told.shape[0]
+    innovation, log_det = 0.0, 0.0
+    for i in range(m):
+        h, Ph = np.zeros(n), np.zeros(n)
+        h[i] = 1.0
+        h[m + i] = motion[i]
+        if n > 2 * m:
+            h[2 * m] = slopes[i]
+        for j in range(n):
+            for k in range(n):
+                Ph[j] += P[j, k] * h[k]
+        S, e = noise * noise, missed[i]
+        for j in range(n):
+            S += h[j] * Ph[j]
+            e -= h[j] * told[j]
+        innovation += e * e / S
+        log_det += math.log(S)
+        for j in range(n):
+            told[j] += Ph[j] / S * e
+            for k in range(n):
+                P[j, k] -= Ph[j] * Ph[k] / S
+    return innovation, log_det
+
+
 def nonlinear_tell(
     p: NonlinearArrays,
     free: np.ndarray,
     model: np.ndarray,
     angles: np.ndarray,
-    disturbance: np.ndarray,
+    motion: np.ndarray,
+    told: np.ndarray,
     reached: np.ndarray,
     motors: np.ndarray,
     outputs: np.ndarray,
 ) -> None:
     """Predict from the filter's time to now under the newest set-points; fill angles and rates.
 
-    `model`, `angles` and `reached` are overwritten.
+    `model`, `angles`, `motion` (in the last sample) and `reached` are overwritten.
     """
     c, m = p.constants, p.outputs
     whole = int(c[KALMAN_LEAD])
     part = c[KALMAN_LEAD] - whole
-    before = np.empty(m)
+    before, earlier = np.empty(m), np.empty(m)
     for _ in range(whole + 1):
         before[:] = angles
+        earlier[:] = motion
         nonlinear_slew(p, reached, motors)
         nonlinear_move(p, free, model, reached, angles)
+        motion[:] = angles - before
     for i in range(m):
-        # Linear interpolation between samples; the rate is its slope.
-        outputs[i] = before[i] + part * (angles[i] - before[i]) + disturbance[i]
-        outputs[m + i] = (angles[i] - before[i]) / c[KALMAN_PERIOD]
+        # Linear interpolation between samples, of the motion in the last sample too; the rate is its slope.
+        late = told[m + i] * (earlier[i] + part * (motion[i] - earlier[i]))
+        outputs[i] = before[i] + part * motion[i] + told[i] + late
+        outputs[m + i] = motion[i] / c[KALMAN_PERIOD]

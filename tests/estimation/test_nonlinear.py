@@ -28,7 +28,7 @@ from .necks import changed, jumping, neck, ramped, with_levels
 
 # In time, and a disturbance whose walk does not depend on the motion.
 WALK, NOISE = math.radians(0.3), math.radians(0.05)
-PLAIN = KalmanSettings(sensor_delay=0.0)
+PLAIN = KalmanSettings(sensor_delay=0.0, measurement_noise_std=NOISE)
 OURS = KalmanSettings()
 
 
@@ -66,21 +66,27 @@ def free_run(model: Model, run: Recording) -> np.ndarray:
     return block.run(block.initial_state(use_measurement=0.0), rows)[1][300:, :m]
 
 
-def test_its_disturbance_is_filterpys_walk_over_what_the_model_misses(play: Model, run: Recording) -> None:
+def test_it_is_filterpys_walk_and_timing_error_over_what_the_model_misses(play: Model, run: Recording) -> None:
     spoilt = changed(run, list(range(3, 480, 5)), math.nan, "pitch")
-    estimates, angles = walking(PLAIN, play).estimate(spoilt), free_run(play, run)
-    kf: Any = KalmanFilter(dim_x=2, dim_z=2)
-    kf.F = kf.H = np.eye(2)
-    kf.Q, kf.R, kf.P = WALK**2 * np.eye(2), NOISE**2 * np.eye(2), math.radians(40.0) ** 2 * np.eye(2)
+    observer = walking(PLAIN, play)
+    estimates, angles, motion = observer.estimate(spoilt), free_run(play, run), observer.simulate(spoilt)[1]
+    np.testing.assert_allclose(motion[1:], np.diff(angles, axis=0), rtol=0, atol=1e-12)
+    kf: Any = KalmanFilter(dim_x=4, dim_z=2)
+    # A timing error of one sample that lasts for 4 s.
+    kept = math.exp(-0.02 / 4.0)
+    kf.F = np.diag([1.0, 1.0, kept, kept])
+    kf.Q = np.diag([WALK**2] * 2 + [1.0 - kept**2] * 2)
+    kf.R, kf.P = NOISE**2 * np.eye(2), np.diag([math.radians(40.0) ** 2] * 2 + [1.0] * 2)
     told, log_det = np.empty_like(angles), np.empty(len(run))
     for k, z in enumerate(spoilt.outputs):
         kf.predict()
+        kf.H = np.hstack([np.eye(2), np.diag(motion[k])])
         kf.update(None if np.isnan(z).any() else z - angles[k])
-        told[k], log_det[k] = angles[k] + kf.x[:, 0], np.linalg.slogdet(kf.S)[1]
+        told[k], log_det[k] = angles[k] + (kf.H @ kf.x)[:, 0], np.linalg.slogdet(kf.H @ kf.P_prior @ kf.H.T + kf.R)[1]
     assert estimates.accepted[np.isfinite(spoilt.outputs).all(axis=1)].all()
     # The walk of a billionth of the motion is beyond these digits.
     np.testing.assert_allclose(estimates.outputs, told, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(estimates.covariance[-1], kf.P, rtol=1e-9)
+    np.testing.assert_allclose(estimates.covariance[-1], kf.H @ kf.P @ kf.H.T, rtol=1e-9)
     np.testing.assert_allclose(estimates.log_det[estimates.judged], log_det[estimates.judged], rtol=1e-9)
 
 
@@ -93,14 +99,29 @@ def test_a_jump_moves_the_model_as_a_ramp_of_the_motors_rate_does(play: Model, r
     np.testing.assert_array_equal(told.outputs, free.estimate(ramped(jumping(run), rate)).outputs)
 
 
-def test_files_from_before_take_jumps_as_they_come(play: Model, run: Recording, tmp_path: Path) -> None:
+def test_files_from_before_take_jumps_as_they_come_and_no_timing_error(
+    play: Model, run: Recording, tmp_path: Path
+) -> None:
     observer = walking(PLAIN, play)
     observer.save(tmp_path / "new.npz")
     header, arrays = read_archive(tmp_path / "new.npz")
-    assert header.pop("slew") == [15.6, 15.6, 15.6]
+    assert (header.pop("slew"), header.pop("timing")) == ([15.6, 15.6, 15.6], 0.02)
     write_archive(tmp_path / "old.npz", header, arrays)
-    expected = replace(observer, slew=None).estimate(jumping(run))
+    expected = replace(observer, slew=None, timing=0.0).estimate(jumping(run))
     np.testing.assert_array_equal(load(tmp_path / "old.npz").estimate(jumping(run)).outputs, expected.outputs)
+
+
+def test_its_sensor_is_at_least_as_noisy_as_the_recordings(play: Model) -> None:
+    poor, good = (
+        replace(play, findings={**play.findings, "sensor_noise": [math.radians(0.01), math.radians(noise)]})
+        for noise in (0.25, 0.02)
+    )
+    # White noise of 0.05 deg in 3,000 rows of two outputs, by medians: to 4 %.
+    assert max(play.findings["sensor_noise"]) == pytest.approx(NOISE, rel=0.1)
+    assert (designed(OURS, poor).noise[0], designed(OURS, poor).sensor) == (math.radians(0.25), "recording")
+    assert (designed(OURS, good).noise[0], designed(OURS, good).sensor) == (NOISE, "paper")
+    given = (designed(settings, poor).noise[0] for settings in (PLAIN, KalmanSettings(sensor="mpu9250")))
+    assert tuple(given) == (NOISE, math.radians(0.29))
 
 
 @pytest.mark.parametrize("lead", [0.0, 0.04, 0.05])
@@ -139,21 +160,22 @@ def test_a_push_is_what_the_model_misses(play: Model, run: Recording) -> None:
     z = free_run(play, run) + pushed + math.radians(0.05) * rng.standard_normal(pushed.shape)
     observer = designed(replace(OURS, sensor_delay=0.0), play)
     _, states = run_filter(observer, run.with_channels(pitch=z[:, 0], roll=z[:, 1]))
-    found = states[:, observer._parts["disturbance"]]
+    found = states[:, observer._parts["told"]][:, :2]
     # Within a second; noise of 0.05 deg, most of which a disturbance as large as the motion lets through.
     np.testing.assert_allclose(found[250:], pushed[250:], atol=math.radians(0.25))
 
 
 def test_a_disturbance_walks_as_far_as_the_model_moves(play: Model, run: Recording) -> None:
-    """What is gained from a measurement after a gap: all of it in motion, little at rest."""
+    """What is gained from a measurement after a gap: all of it in motion, little at rest; and a sample's motion."""
     dark = run.with_channels(pitch=np.full(480, math.nan), roll=np.full(480, math.nan))
     spread = np.sqrt(walking(OURS, play, 1e-9, 0.5).estimate(dark).covariance[:, 0, 0])
     start, angles = math.radians(40.0), free_run(play, run)
-    fastest, expected = 0.0, [start**2]
-    for motion in np.abs(np.diff(angles, axis=0)).max(axis=1):
-        fastest = max(0.95 * fastest, float(motion))
-        expected.append(expected[-1] + (0.5 * fastest) ** 2)
-    np.testing.assert_allclose(spread[1:] ** 2, expected[1:], rtol=1e-9)
+    fastest, walked, expected = 0.0, start**2, []
+    for motion in np.abs(np.diff(angles, axis=0)):
+        fastest = max(0.95 * fastest, float(motion.max()))
+        walked += (0.5 * fastest) ** 2
+        expected.append(walked + float(motion[0]) ** 2)
+    np.testing.assert_allclose(spread[1:] ** 2, expected, rtol=1e-9)
 
 
 def test_outliers_are_refused_and_a_lasting_change_is_taken_in_by_force(play: Model, run: Recording) -> None:

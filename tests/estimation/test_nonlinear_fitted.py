@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from softneck.core import SettingsError
 from softneck.estimation import KalmanSettings, NonlinearObserver, fit_noise
@@ -20,7 +21,7 @@ from softneck.signals import Recording, concatenate, signal
 
 from .necks import without
 
-TRUE = (math.radians(0.25), math.radians(0.1), 0.4)
+TRUE = (math.radians(0.25), math.radians(0.2), 0.8)
 
 
 @pytest.fixture(scope="module")
@@ -36,11 +37,13 @@ def observer() -> NonlinearObserver:
 def walking(observer: NonlinearObserver) -> Recording:
     """A recording of which the observer's own assumptions are true, at the levels `TRUE`."""
     run = record(signal("steps"), VirtualNeck(NeckParameters.paper()), seed=7)
-    angles, fastest = observer.simulate(run)
+    angles, motion, fastest = observer.simulate(run)
+    _, timing, kept = observer.walk_start
     rng, runs = np.random.default_rng(3), []
     for _ in range(4):
         steps = np.sqrt(TRUE[1] ** 2 + (TRUE[2] * fastest) ** 2)[:, None] * rng.standard_normal(angles.shape)
-        told = angles + np.cumsum(steps, axis=0) + TRUE[0] * rng.standard_normal(angles.shape)
+        late = lfilter([math.sqrt(timing * (1.0 - kept**2))], [1.0, -kept], rng.standard_normal(angles.shape), axis=0)
+        told = angles + late * motion + np.cumsum(steps, axis=0) + TRUE[0] * rng.standard_normal(angles.shape)
         runs.append(run.with_channels(pitch=told[:, 0], roll=told[:, 1]))
     return concatenate(runs)
 

@@ -26,7 +26,7 @@ from ..foreign_necks.necks import ForeignNeck
 from ..foreign_necks.necks import record as record_foreign
 from .necks import jumping, ramped, without
 
-NOISE, REST, RATIO, START = math.radians(0.05), math.radians(0.1), 1.0, math.radians(40.0)
+NOISE, REST, RATIO, START = math.radians(0.05), math.radians(0.1), 0.6, math.radians(40.0)
 STEP = 0.02
 # All is taken in, and the estimate is of the measurement's instant.
 PLAIN = KalmanSettings(sensor_delay=0.0)
@@ -92,20 +92,23 @@ def test_it_is_filterpys_extended_filter(model: Model, run: Recording) -> None:
     # It begins at the heaviest.
     payload, Z, U = 1.0, run.outputs, run.set_points
     thought, more = _Copy(model, payload, U[0]), _Copy(model, payload + STEP, U[0])
-    ekf: Any = ExtendedKalmanFilter(dim_x=3, dim_z=2)
-    ekf.P, ekf.R, ekf.F = np.diag([START**2, START**2, 1.0]), (20.0 * NOISE) ** 2 * np.eye(2), np.eye(3)
-    ekf.x, fastest, told, masses = np.zeros(3), 0.0, [], []
+    # Disturbances, timing errors of one sample that last for some seconds, and the payload.
+    kept = float(observer.walk_start[2])
+    ekf: Any = ExtendedKalmanFilter(dim_x=5, dim_z=2)
+    ekf.P, ekf.R = np.diag([START**2, START**2, 1.0, 1.0, 1.0]), (20.0 * NOISE) ** 2 * np.eye(2)
+    ekf.F = np.diag([1.0, 1.0, kept, kept, 1.0])
+    ekf.x, fastest, told, masses = np.zeros(5), 0.0, [], []
     for k, z in enumerate(Z):
         held = U[max(k - 1, 0)]
         before = thought.state.outputs[:2].copy()
         y, beside = thought.move(held, payload), more.move(held, payload + STEP)
         fastest = max(0.95 * fastest, float(np.abs(y - before).max()))
-        H = np.column_stack([np.eye(2), (beside - y) / STEP])
-        ekf.Q = np.diag([REST**2 + (RATIO * fastest) ** 2] * 2 + [walk**2])
+        H = np.column_stack([np.eye(2), np.diag(y - before), (beside - y) / STEP])
+        ekf.Q = np.diag([REST**2 + (RATIO * fastest) ** 2] * 2 + [1.0 - kept**2] * 2 + [walk**2])
         ekf.predict()
         ekf.update(z - y, lambda _, H=H: H, lambda x, H=H: H @ x)
-        payload, ekf.x[2] = float(np.clip(payload + ekf.x[2], 0.0, 1.0)), 0.0
-        told.append(y + ekf.x[:2])
+        payload, ekf.x[4] = float(np.clip(payload + ekf.x[4], 0.0, 1.0)), 0.0
+        told.append(y + H @ ekf.x)
         masses.append(payload)
     outputs, _ = run_filter(observer, run)
     # One Joseph form against one without, over 400 samples.

@@ -5,6 +5,7 @@ All is scaled and rounded before anything is learned, so that neither units nor 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, Vector, to_si
 from softneck.robot import Robot
-from softneck.signals import Recording, concatenate, independent_motions
+from softneck.signals import Recording, check_channel, concatenate, independent_motions
 
 from ._arrays import MOST_PAYLOAD, trained_set_points
 from ._model import WARM_UP, Model
@@ -165,6 +166,16 @@ def in_display_unit(robot: Robot, values: Vector) -> Vector:
     return np.degrees(values) if unit == "deg" else values / to_si(unit)[0]
 
 
+def sensor_noise(recording: Recording) -> list[float]:
+    """Return the standard deviation of the noise of each output, as the recording shows it [SI]."""
+    found = []
+    for name in recording.robot.outputs.names:
+        channel = check_channel(recording, name)
+        # Rounded values are as uncertain as their steps are wide.
+        found.append(max(float(np.nan_to_num(channel.noise)), (channel.quantum or 0.0) / math.sqrt(12.0)))
+    return found
+
+
 def fitted_model(
     kind: str,
     settings: DataclassInstance,
@@ -179,7 +190,7 @@ def fitted_model(
         sample_time=recording.sample_time,
         arrays=arrays,
         settings=asdict(settings),
-        findings={**findings, **trained_set_points(recording)},
+        findings={**findings, **trained_set_points(recording), "sensor_noise": sensor_noise(recording)},
         training_rows=row_hashes(recording),
         robot=recording.robot,
     )

@@ -22,10 +22,10 @@ from softneck.core import (
     require_whole,
     silent,
 )
-from softneck.signals import Recording, check_channel, concatenate, conditions, merge_conditions
+from softneck.signals import Recording, concatenate, conditions, merge_conditions
 
 from ..models._arrays import check_arrays
-from ..models._fitting import ScaledData
+from ..models._fitting import ScaledData, sensor_noise
 from ..models._model import WARM_UP, Model, embed_model, embedded_model
 from ..structured._greybox_draws import GreyBoxDraws
 from ..structured._play_draws import PlayDraws
@@ -320,7 +320,7 @@ class _Motions:
         motion = np.array([0.5 * np.ptp(y[group == k], axis=0).max() for k in range(group.max() + 1)])
         part = motion / motion.max()
         classes = np.searchsorted([low for _, low, _ in _CLASSES], part, side="right") - 1
-        return cls(held, model, y, group, motion, classes, _noise(held))
+        return cls(held, model, y, group, motion, classes, np.array(sensor_noise(held)))
 
     def simulate(self, draws: Sequence[Mapping[str, Matrix]]) -> np.ndarray:
         """Return the simulations (draws, rows, outputs)."""
@@ -406,16 +406,6 @@ def _pair_cost(e: Matrix, then: Matrix, before: Matrix, after: Matrix, keep: flo
     a, b, c = before + noise, after + noise, keep * before
     determinant = a * b - c**2
     return float((np.log(determinant) + (b * e**2 - 2.0 * c * e * then + a * then**2) / determinant).sum())
-
-
-def _noise(recording: Recording) -> Vector:
-    """Return the standard deviation of each sensor's noise (outputs,), as the recording shows it [SI]."""
-    found = []
-    for name in recording.robot.outputs.names:
-        channel = check_channel(recording, name)
-        # Rounded values are as uncertain as their steps are wide.
-        found.append(max(float(np.nan_to_num(channel.noise)), (channel.quantum or 0.0) / math.sqrt(12.0)))
-    return np.array(found)
 
 
 def _filtered(moves: Matrix, keep: float) -> Matrix:
