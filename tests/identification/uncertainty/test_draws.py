@@ -18,6 +18,7 @@ from scipy.signal import lfilter
 
 from softneck.core import DataError, FileFormatError, SettingsError, load
 from softneck.identification import Draws, Family, Model, make_draws
+from softneck.identification.models._fitting import sensor_noise
 from softneck.identification.structured._play import Play
 from softneck.identification.structured._play_draws import PlayDraws
 from softneck.identification.uncertainty import _draws
@@ -458,8 +459,8 @@ def test_the_noise_of_a_rounding_sensor_is_no_less_than_its_steps_tell(step: flo
     recording, least = neck_recording(450), step / math.sqrt(12.0)
     y = recording.outputs
     rounded = step * np.round(y / step) if step else y
-    found = _draws._noise(recording.with_channels(pitch=rounded[:, 0], roll=rounded[:, 1]))
-    plain = _draws._noise(recording)
+    found = np.array(sensor_noise(recording.with_channels(pitch=rounded[:, 0], roll=rounded[:, 1])))
+    plain = np.array(sensor_noise(recording))
     # Two deviations of independent errors add in squares; the estimate of both is right to a factor of 1.5.
     assert (found >= 0.999 * least).all()
     assert (found <= 1.5 * np.hypot(plain, least)).all()
