@@ -1245,6 +1245,43 @@ def test_what_no_loop_over_draws_tells_resumes_no_search(monkeypatch: pytest.Mon
         assert (tried, certified.verification.holds) == (verified[-1], holds == 1)
 
 
+@pytest.mark.parametrize(
+    ("missed", "tried", "resumes"),
+    [({}, 1, False), ({0: 1.1}, 1, False), ({0: 1.16}, 1, True), ({1: 5.1}, 1, True), ({0: 1.1, 1: 5.1}, 1, True),
+     ({2: 1.9}, 1, True), ({0: 1.16}, 4, True), ({0: 1.16}, 5, False), ({0: None}, 1, True)],
+)  # fmt: skip
+def test_a_certificate_resumes_a_search_unless_little_speed_alone_fails_or_no_draws_are_left(
+    missed: dict[int, float | None], tried: int, resumes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failed = [Verdict(LIMITS[k], value, False, {}) for k, value in missed.items()]
+    asked = SimpleNamespace(bounds=LIMITS, stated=frozenset(), kept={})
+    task: Any = SimpleNamespace(digest="d", own={}, drawn=("draw",), asked=asked, bounds=LIMITS, linear={})
+    best = Candidate("a", {}, np.zeros(1), "margins", FINE)
+    search: Any = SimpleNamespace(task=task, sort_candidates=lambda: [best])
+    verification = SimpleNamespace(holds=not failed, failed=failed, evidence=SimpleNamespace(drawn=[]))
+    certified: Any = SimpleNamespace(item=best, verification=verification)
+    monkeypatch.setattr(_tune, "_verify_best", lambda *_: (certified, tried))
+    monkeypatch.setattr(_tune, "_failing_draws", lambda _, failed: {"draw 2": 1} if failed else {})
+
+    def replaced(*_: Any, **__: Any) -> Any:
+        raise KeyError("it resumes")
+
+    monkeypatch.setattr(_tune, "replace", replaced)
+    if resumes:
+        with pytest.raises(KeyError, match="it resumes"):
+            _tune._certify_search(search, None, lambda *_: None)
+    else:
+        assert _tune._certify_search(search, None, lambda *_: None) == (search, certified, tried)
+    # A margin that nothing told counts as none.
+    kept = _tune._more_kept({"axes.gain_margin": 0.2}, [Verdict(LIMITS[2], None, False, {})])
+    assert kept == {"axes.gain_margin": pytest.approx(2.2)}
+    # What loops of a search say decides only where there are draws among them.
+    item = Candidate("a", {}, np.zeros(1), "margins", {"sim.overshoot_pct": 9.0})
+    assert [v.requirement for v in _tune._failed_in_search(task, item)] == [LIMITS[1]]
+    task.drawn = ()
+    assert _tune._failed_in_search(task, item) == []
+
+
 def test_at_most_three_draws_join_each_once_though_it_is_the_worst_in_several_metrics() -> None:
     def part(family: str, *worst: int | None) -> Any:
         told = dict(zip("abc", worst, strict=True))
@@ -1315,12 +1352,14 @@ def test_a_certificate_is_of_the_loop_that_is_delivered_without_the_draws_of_the
 
 
 def ended(
-    monkeypatch: pytest.MonkeyPatch, *, verified: list[Any], level: str = "all", own: bool = True, m: float = 0.5
-) -> Any:
+    monkeypatch: pytest.MonkeyPatch, *, verified: list[Any], level: str = "all", own: bool = True, m: float = 0.5,
+    ahead: float = 0.5,
+) -> Any:  # fmt: skip
     """Return the result of a search whose best has this level, over verdicts (holds, value)."""
-    bounds = (Requirement("sim.rise_s", "max", 1.0, True),)
+    bounds = (Requirement("sim.rise_s", "max", 1.0, True), Requirement("track.ahead_rms_deg", "max", 1.0, True))
     task = task_for({}, own={"p": 1} if own else {}, bounds=bounds, tested=False)
-    best = Candidate("pi", {}, np.zeros(1), level, {"sim.rise_s": m, "axes.sensitivity": 1.0})
+    metrics = {"sim.rise_s": m, "axes.sensitivity": 1.0, "track.ahead_rms_deg": ahead}
+    best = Candidate("pi", {}, np.zeros(1), level, metrics)
     failed = [SimpleNamespace(value=value, requirement=bounds[0]) for holds, value in verified if not holds]
     verification = SimpleNamespace(holds=not failed, failed=failed)
     certified = _tune._Certified(best, SimpleNamespace(design={}), False, verification)  # pyright: ignore[reportArgumentType]
@@ -1337,6 +1376,9 @@ def test_a_result_holds_where_its_certificate_its_loops_and_its_search_do(monkey
     assert (good.holds, good.binding, good.evaluations, good.dropped) == (True, None, 2, {"lqg": "no"})
     what, slow = ended(monkeypatch, verified=[(True, 0.5)], m=1.5)
     assert (what, slow.holds, slow.binding, slow.nearest) == ("relaxed", False, "sim.rise_s", pytest.approx(1.5))
+    # `verify` runs no circles: those of the search count.
+    what, off = ended(monkeypatch, verified=[(True, 0.5)], ahead=1.5)
+    assert (what, off.holds, off.binding) == ("relaxed", False, "track.ahead_rms_deg")
     # The certificate covers more plants than the search; of two that fail there is no nearest value.
     what, found = ended(monkeypatch, verified=[(False, 1.2)])
     assert (what, found.holds, found.binding, found.nearest) == ("relaxed", False, "sim.rise_s", 1.2)
@@ -1348,6 +1390,42 @@ def test_a_result_holds_where_its_certificate_its_loops_and_its_search_do(monkey
     early = ended(monkeypatch, verified=[(True, 0.5)], level="linear")
     assert early.holds is False
     assert ended(monkeypatch, verified=[(True, 0.5)], level="linear", own=False).holds is True
+
+
+def test_loops_are_compared_with_loops_and_an_observer_is_judged_where_there_are_some(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    levels = [of_kind("a", 0.5, level, number=k) for k, level in enumerate(("margins", "all", "linear"))]
+    search: Any = SimpleNamespace(sort_candidates=lambda: levels)
+    assert _tune._compared(search) == levels[:2]
+    levels[:] = levels[2:]
+    assert _tune._compared(search) == levels
+    monkeypatch.setattr(_tune, "make_observer", lambda _, kind: "eyes" if kind == "mpc" else None)
+    monkeypatch.setattr(_tune, "holds_with_observer", lambda *_: True)
+    for own, eyes, kind, observed in (
+        ({}, "eyes", "pi", False), ({"p": 1}, "eyes", "pi", True), ({"p": 1}, None, "pi", False),
+        ({}, "eyes", "mpc", True),
+    ):  # fmt: skip
+        task = task_for({}, own=own, observer=eyes, bounds=())
+        assert _tune._observed(task, of_kind(kind, 0.5)) is observed
+
+
+def test_the_observer_is_over_a_model_with_payloads_if_there_is_one_that_it_takes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    light, heavy = SimpleNamespace(arrays={}), SimpleNamespace(arrays={"payload": np.array([0.0, 1.0, -3.0, -0.2])})
+    refused: list[Any] = []
+
+    def design(_: Any, model: Any) -> Any:
+        if model in refused:
+            raise SettingsError("not this one")
+        return model
+
+    monkeypatch.setattr(_tune.KalmanSettings, "design", design)
+    task = task_for({}, models=[light, heavy], linear={"a": "first", "b": "second"})
+    for expected in (heavy, "first", None):
+        assert _tune._observer(task) is expected
+        refused.append(expected)
 
 
 def test_a_search_without_any_result_says_whether_the_budget_or_the_designs_ended_it() -> None:
@@ -1445,10 +1523,10 @@ def test_where_the_best_fails_in_more_the_best_of_another_kind_is_verified_and_r
     assert relaxed(monkeypatch, items, {}, 1)[1] == [("lqg", False, 2), ("lqg", True, 3)]
     assert relaxed(monkeypatch, items, {}, 2)[1] == [("lqg", False, 3), ("lqg", True, 4)]
     assert relaxed(monkeypatch, items, {}, 3)[1] == []
-    # One that fails in its margins in the search is left out.
-    poor = rising("lqg")
+    # One that fails in its margins in the search is left out, and one that could not be judged to its end.
+    poor, lost = rising("lqg"), replace(rising("lqg"), error="it diverged")
     poor.metrics["axes.sensitivity"] = 9.0
-    assert relaxed(monkeypatch, [items[0], poor], {}, 1)[1] == []
+    assert relaxed(monkeypatch, [items[0], poor, lost], {}, 1)[1] == []
 
 
 @dataclass(frozen=True)
