@@ -47,8 +47,8 @@ class PlayStructure:
         """(n, 3) signals whose product is each term, with -1 for 1; the constant comes first."""
         chains = 1 + len(self.widths)
         rows = [[-1, -1, -1]] + [[i, -1, -1] for i in range(self.inputs * chains * self.order)]
-        # The last filter but one: late enough for the neck's statics, whose curvature this is.
-        late = [c * chains * self.order + self.order - 2 for c in range(self.inputs)]
+        # Behind the widest play, the last filter but one: late enough for the statics, whose curvature this is.
+        late = [(c + 1) * chains * self.order - 2 for c in range(self.inputs)]
         if self.degree >= 2:
             rows += [[*pair, -1] for pair in combinations_with_replacement(late, 2)]
         if self.degree >= 3:
@@ -168,11 +168,11 @@ def _far(signals: Matrix, good: np.ndarray) -> np.ndarray:
 
 
 # What the hold-out chooses from, scaled: filters about as fast as the robot, 5, and three times that; plays up to a
-# tenth of the motors' range of 6.
+# seventh of the motors' range of 6.
 _FILTER_RATES = (6.0, 15.0)
 # Of robots whose time constant is found from data, only roughly.
 _ALL_FILTER_RATES = (4.0, 6.0, 10.0, 15.0, 25.0)
-_PLAY_WIDTHS = ((), (0.3,), (0.1, 0.3, 0.6))
+_PLAY_WIDTHS = ((), (0.3,), (0.1, 0.3, 0.9))
 _POLYNOMIAL_DEGREES = (1, 2, 3)
 _RIDGE_WEIGHTS = (1e-6, 1e-4, 1e-2)
 # Of forms whose fits on the hold-out differ by less than this [points], that with the fewest terms is taken.

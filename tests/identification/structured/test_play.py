@@ -121,6 +121,28 @@ def test_ridge_without_weight_is_least_squares_and_a_heavy_one_is_the_mean() -> 
     np.testing.assert_allclose(X @ ridge(X, Y, 1e9).T, np.tile(Y.mean(axis=0), (200, 1)), rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("widths", [(), (0.3,), (0.1, 0.3, 0.9)])
+@pytest.mark.parametrize("degree", [2, 3])
+def test_products_are_of_what_passes_the_widest_play(widths: tuple[float, ...], degree: int) -> None:
+    """A motor that moves within the gap of the widest play moves no product: the curve is behind the hysteresis."""
+    form = PlayStructure(15.0, 5, widths, degree)
+    # To 2 rad, back by the whole gap, then about its middle: no play is left at an edge by less than 1e-9.
+    gap = 2.0 * max(widths, default=0.0)
+    path = np.concatenate(
+        [np.full(300, 2.0), np.full(300, 2.0 - gap / 2), 2.0 - gap / 2 + 0.4 * gap * np.sin(np.arange(300.0))]
+    )
+    signals = bank(np.tile(path[:, None], (1, 3)), list(widths), float(form.chain(0.02)[0]), 5)
+    table = form.table.astype(int)
+    products = table[(table >= 0).sum(axis=1) > 1]
+    assert len(products) == 6 + 4 * (degree == 3)
+    signals = np.column_stack([signals, np.ones(len(signals))])
+    values = signals[590:, products[:, 0]] * signals[590:, products[:, 1]] * signals[590:, products[:, 2]]
+    # Five filters of 15 1/s have forgotten a step after 5.8 s: exp(-87) of it and powers of 87 are left.
+    assert np.ptp(values, axis=0).max() < 1e-9
+    if widths:
+        assert np.ptp(signals[590:, 4]) > 1e-3  # the plain chain moves
+
+
 def test_training_sees_what_the_free_run_computes() -> None:
     recording = short_neck()
     model = Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording)
