@@ -368,7 +368,7 @@ def _check(name: str, axis: AxisFamily, frequencies: int) -> None:
     for key, shape in shapes.items():
         if getattr(axis, key).shape != shape:
             raise FileFormatError(f"its array `{name}_{key}` has shape {getattr(axis, key).shape}; {shape} is needed.")
-    for key in ("samples", "nominal", "box", "weight"):
+    for key in ("samples", "used", "nominal", "box", "weight", "envelope"):
         if not np.isfinite(getattr(axis, key)).all():
             raise FileFormatError(f"its array `{name}_{key}` is not finite.")
     for key in ("samples", "nominal", "box"):

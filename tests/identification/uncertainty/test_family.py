@@ -15,14 +15,17 @@ from softneck.core import DataError, FileFormatError, SettingsError, load
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings
 from softneck.identification import Family, FamilySettings
+from softneck.identification.uncertainty import _family_fit
+from softneck.identification.uncertainty._family import one_pole, relative_errors
 from softneck.identification.uncertainty._family_fit import envelope_weight
+from softneck.identification.uncertainty._local_models import Local, Window
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
 
 from ...data import TRUTH, TS, Truth, neck_recording, recording_from
 from ...oracles.bake_off import exact
-
-pytestmark = pytest.mark.slow
+from ...verification.necks import PAPER
+from ...verification.necks import family as small_family
 
 # Gains of three payloads on one pole and dead time each.
 PAYLOADS = [Truth(gain=(0.011 * k, 0.008 * k)) for k in (0.8, 1.0, 1.25)]
@@ -44,6 +47,7 @@ def family(recordings: list[Recording]) -> Family:
     return FamilySettings(directions=1).fit(recordings)
 
 
+@pytest.mark.slow
 @given(
     gains=st.tuples(st.floats(0.3, 0.95), st.floats(1.05, 3.0)),
     poles=st.tuples(st.floats(0.3, 0.95), st.floats(1.05, 3.0)),
@@ -68,6 +72,7 @@ def test_a_weight_covers_its_envelope_and_is_stable_and_of_minimum_phase(
     assert max(above.size, below.size) <= order + 1
 
 
+@pytest.mark.slow
 def test_order_two_is_close_to_an_envelope_of_the_facts() -> None:
     """Facts: +-40 % gain and pole, +-20 ms: order 2 within 4 %."""
     w = np.geomspace(0.05, 150.0, 100)
@@ -85,6 +90,7 @@ def test_order_two_is_close_to_an_envelope_of_the_facts() -> None:
     assert closeness[0] > closeness[1] > closeness[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 1])
 def test_local_models_find_gain_pole_and_delay_of_every_payload(family: Family, axis: int) -> None:
     name = ("pitch", "roll")[axis]
@@ -103,6 +109,7 @@ def test_local_models_find_gain_pole_and_delay_of_every_payload(family: Family, 
     assert np.quantile(spread, 0.9) < 0.4  # the payloads themselves span -20 to +25 %
 
 
+@pytest.mark.slow
 def test_every_sample_is_in_the_box_and_under_the_weight(family: Family) -> None:
     for name, axis in family.axes.items():
         used = axis.samples[axis.used > 0.5]
@@ -117,6 +124,7 @@ def test_every_sample_is_in_the_box_and_under_the_weight(family: Family) -> None
             assert (np.abs(cast(Any, G)(z) / G0 - 1.0) <= W * (1 + 1e-9)).all()
 
 
+@pytest.mark.slow
 def test_a_file_keeps_every_bit_and_says_what_it_is(family: Family, tmp_path: Path) -> None:
     family.save(tmp_path / "f.npz")
     again = load(tmp_path / "f.npz", role="family")
@@ -132,6 +140,7 @@ def test_a_file_keeps_every_bit_and_says_what_it_is(family: Family, tmp_path: Pa
         load(tmp_path / "b.npz")
 
 
+@pytest.mark.slow
 def test_a_design_reads_it(family: Family) -> None:
     controller = PiSettings().design(exact(family))
     assert controller.design["pitch"]["dead_time_s"] == pytest.approx(0.06)
@@ -146,6 +155,7 @@ def test_a_design_reads_it(family: Family) -> None:
 
 
 @pytest.mark.nightly
+@pytest.mark.slow
 def test_gains_across_the_axes_are_told() -> None:
     P = signal("mixed", duration=60.0, seed=3).set_points.copy()
     P[:15] = 0.0
@@ -176,6 +186,7 @@ def _lag(u: np.ndarray, pole: float, delay: int) -> np.ndarray:
 
 
 @pytest.mark.nightly
+@pytest.mark.slow
 def test_the_virtual_neck_and_the_real_one(shared_data: Path) -> None:
     from softneck.signals import import_log, read_layout
 
@@ -199,6 +210,7 @@ def test_the_virtual_neck_and_the_real_one(shared_data: Path) -> None:
     assert gains[0] < gains[1] < gains[2]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_made_a_family_is_named(recordings: list[Recording]) -> None:
     still = neck_recording(400)
     P = still.set_points
@@ -213,3 +225,105 @@ def test_what_cannot_be_made_a_family_is_named(recordings: list[Recording]) -> N
     for key, value in (("weight_order", 4), ("window", -1.0), ("directions", 0)):
         with pytest.raises(SettingsError, match=f"`{key}` must be"):
             FamilySettings(**cast(Any, {key: value}))
+
+
+# -- what is covered, without a fit -----------------------------------------------------------------------------------
+
+FREQUENCY = np.geomspace(0.05, np.pi / TS, 15)
+
+
+def local(scope: str = "point", gain: float = 1.0, pole: float = 1.0, late: float = 1.0) -> Local:
+    return Local(scope=scope, recording=0, time=1.0, inclination=0.1, direction=0.0, std=np.full(4, 0.01), fit=90.0,
+                 model=one_pole(PAPER * [gain, pole, late]))  # fmt: skip
+
+
+def axis_of(*found: Local) -> Any:
+    return FamilySettings()._axis("pitch", list(found), FREQUENCY, TS, 3)
+
+
+def test_a_plant_more_never_makes_a_family_smaller_and_a_window_changes_nothing() -> None:
+    """Box, envelope and weight are the worst of operating points and recordings, in whatever order they stand."""
+    middle, far, within = local(), local(gain=1.3, pole=0.8), local("recording", gain=1.1, pole=0.95)
+    base = axis_of(middle, far)
+    for more in ((within, far, middle), (far, local("window", gain=9.0), middle, within)):
+        found = axis_of(*more)
+        used = found.samples[found.used > 0.5]
+        np.testing.assert_array_equal(found.box, [used.min(axis=0), used.max(axis=0)])
+        np.testing.assert_allclose(found.box, base.box)
+        np.testing.assert_allclose(found.envelope, base.envelope, rtol=1e-9)
+        assert len(used) == 3
+    wider = axis_of(middle, far, local(gain=0.5))
+    assert (wider.box[0] <= base.box[0] + 1e-12).all()
+    assert (wider.box[1] >= base.box[1] - 1e-12).all()
+    assert wider.envelope.max() > base.envelope.max()
+    for item in (base, wider):
+        fine = np.geomspace(FREQUENCY[0], FREQUENCY[-1], 5 * FREQUENCY.size)
+        W = np.abs(np.polyval(item.weight[0], 1j * fine) / np.polyval(item.weight[1], 1j * fine))
+        errors = relative_errors(item.samples[item.used > 0.5], item.nominal, fine, TS)
+        assert (errors <= W * (1.0 + 1e-9)).all()  # on a grid finer than the fit's
+        np.testing.assert_allclose(item.envelope, relative_errors(
+            item.samples[item.used > 0.5], item.nominal, FREQUENCY, TS).max(axis=0))  # fmt: skip
+    family = replace(small_family(), axes={"pitch": base, "roll": base}, frequency=FREQUENCY)
+    assert 0.5 < family.covered("pitch") <= 1.0 + 1e-9
+    # The farthest decides, not the mean; a sample that is not used does not.
+    poor = replace(base, samples=np.vstack([base.samples, base.samples[0] * [3.0, 1.0, 1.0]]), used=np.ones(3))
+    assert replace(family, axes={"pitch": poor, "roll": base}).covered("pitch") > 2.0
+    unused = replace(poor, used=np.array([1.0, 1.0, 0.0]))
+    assert replace(family, axes={"pitch": unused, "roll": base}).covered("pitch") == family.covered("pitch")
+    for few in ([middle], [middle, local("window"), local("window")]):
+        with pytest.raises(DataError, match=r"only 1 local models say enough \(3 windows do not\)"):
+            axis_of(*few)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_a_weight_covers_an_envelope_with_a_peak_between_its_lines(order: int) -> None:
+    w = np.geomspace(0.05, 150.0, 25)
+    envelope = 0.2 + 1.5 * np.exp(-((np.log(w / 6.0) / 0.3) ** 2))
+    above, below = envelope_weight(w, envelope, order)
+    fine = np.geomspace(w[0], w[-1], 400)
+    wanted = np.exp(np.interp(np.log(fine), np.log(w), np.log(envelope)))
+    # The lines between the envelope's points, to the spacing of its own finer grid.
+    assert (np.abs(np.polyval(above, 1j * fine) / np.polyval(below, 1j * fine)) >= 0.995 * wanted).all()
+    for bad in (np.nan, np.inf):
+        with pytest.raises(SettingsError, match="must be finite"):
+            envelope_weight(w, np.where(np.arange(25) == 7, bad, envelope), order)
+
+
+def test_points_and_recordings_are_of_the_windows_that_say_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that stood still adds nothing to its point and none to its recording, and is counted."""
+
+    def window(recording: int, inclination: float, direction: float, says: bool = True) -> Window:
+        return Window(recording=recording, time=float(says), inputs=np.zeros((2, 2)), outputs=np.zeros((2, 2)),
+                      inclination=inclination, direction=direction)  # fmt: skip
+
+    asked: list[tuple[str, list[int]]] = []
+
+    def fit(_: Any, group: Any, axis: int, *, scope: str, near: Any = None) -> Local | None:
+        if scope != "window":
+            asked.append((scope, [cut.index(item) for item in group]))
+            assert near is not None
+        return local(scope) if group and all(item.time for item in group) else None
+
+    monkeypatch.setattr(_family_fit, "fit_local", fit)
+    cut = [window(0, 0.1, 0.0), window(0, 0.1, 0.1, says=False), window(0, 0.12, 0.1), window(1, 0.1, 0.0),
+           window(0, 0.1, np.pi)]  # fmt: skip
+    found, lost = FamilySettings()._local_models(cast(Any, None), cut, 0, 3)
+    assert sorted(asked) == [("point", [0, 2]), ("point", [3]), ("point", [4]), ("recording", []),
+                             ("recording", [0, 2, 4]), ("recording", [3])]  # fmt: skip
+    assert ([item.scope for item in found], lost) == (["window"] * 4 + ["point"] * 3 + ["recording"] * 2, 1)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("key", ["samples", "used", "nominal", "box", "weight", "envelope"])
+def test_a_family_file_with_one_number_that_is_none_is_refused(key: str, bad: float, tmp_path: Path) -> None:
+    """A sample whose `used` is no number would leave the uncertain plant without a word."""
+    family = small_family()
+    axis = family.axes["roll"]
+    values = getattr(axis, key).copy()
+    values.flat[-1] = bad
+    broken = replace(family, axes={**family.axes, "roll": replace(axis, **{key: values})})
+    broken.save(tmp_path / "f.npz")
+    with pytest.raises(FileFormatError, match=f"`roll_{key}` is not finite"):
+        load(tmp_path / "f.npz", role="family")
+    family.save(tmp_path / "g.npz")
+    assert load(tmp_path / "g.npz", role="family").axes["roll"].used.tolist() == axis.used.tolist()
