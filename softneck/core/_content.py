@@ -28,8 +28,8 @@ def compute_once(compute: Callable[[], _T], *things: Any) -> _T:
     return kept[0]
 
 
-# A search and the certificates of its best need five results.
-@lru_cache(maxsize=6)
+# A search and the certificates of its best need five results, a comparison of kinds ten drives.
+@lru_cache(maxsize=16)
 def _results(digest: str) -> list[Any]:
     del digest
     return []

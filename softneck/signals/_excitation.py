@@ -214,10 +214,10 @@ def _make_multisine(t: Vector, rng: np.random.Generator, pulls: PullDirections) 
 
 
 def _low_crest(t: Vector, tones: Vector, rng: np.random.Generator) -> Vector:
-    coarse = t[::5]
+    angles = np.outer(t[::5], tones)
     phases = min(
         (rng.uniform(0.0, 2.0 * np.pi, tones.size) for _ in range(200)),
-        key=lambda phase: np.abs(np.cos(np.outer(coarse, tones) + phase).sum(axis=1)).max(initial=0.0),
+        key=lambda phase: np.abs(np.cos(angles + phase).sum(axis=1)).max(initial=0.0),
     )
     s = np.cos(np.outer(t, tones) + phases).sum(axis=1)
     return 3.2 * s / np.abs(s).max(initial=1e-12)

@@ -18,6 +18,7 @@ from softneck.core import (
     Progress,
     SettingsError,
     Vector,
+    compute_once,
     one_blas_thread,
     require_one_of,
     require_whole,
@@ -298,6 +299,10 @@ class OutputError:
             DataError: too short, constant, not enough excitation, or no stable model.
         """
         recording = training_recording(recordings)
+        # Kinds that begin with it ask for it again.
+        return compute_once(lambda: self._with_modes(recording, progress), self, recording)
+
+    def _with_modes(self, recording: Recording, progress: Progress) -> Model:
         modes = {}
         if not self.intervals and self.nf != 1:
             found = assess_quality(recording, bandwidth=1.0).modes

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -189,9 +190,15 @@ def make_test_motions(train: Recording, seconds: float, *, seed: int = 0) -> lis
     """Generate motions of `seconds`, before scaling to a recording's speed, with NaN outputs after the start."""
     length = _MIXED_PER_MOTION * seconds
     start, stop = (round(share * length / SAMPLE_TIME) for share in _SINGLE_TENDON_SHARE)
-    alone = signal("mixed", duration=length, seed=seed).set_points[start:stop]
-    moves = [signal(name, duration=seconds, seed=seed).set_points for name in ("aprbs", "multisine")]
+    moves = [_set_points(name, seconds, seed) for name in ("aprbs", "multisine")]
+    alone = _set_points("mixed", length, seed)[start:stop]
     return [_map_to_training(train, motion) for motion in (*moves, alone)]
+
+
+# To draw phases of a low crest factor takes longer than most that is done with a motion.
+@lru_cache(maxsize=8)
+def _set_points(name: str, seconds: float, seed: int) -> Matrix:
+    return signal(name, duration=seconds, seed=seed).set_points
 
 
 def _map_to_training(train: Recording, motion: Matrix) -> Recording:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import Matrix, Vector
+from softneck.core import Matrix, Vector, compute_once
 from softneck.robot import Scaling
 from softneck.runtime import load_functions
 from softneck.signals import Recording
@@ -116,6 +116,11 @@ def load_in_si(load: Vector, scaling: Scaling) -> Vector:
 
 def fit_loaded_drive(recording: Recording, *, limited: bool = True) -> LoadedDrive:
     """Identify drives from logged positions, if `limited` with the load limit where it explains part of the error."""
+    # Of a robot every kind asks for it.
+    return compute_once(lambda: _fit_loaded_drive(recording, limited=limited), recording, limited)
+
+
+def _fit_loaded_drive(recording: Recording, *, limited: bool) -> LoadedDrive:
     from scipy.optimize import minimize
     from scipy.special import expit, logit
 

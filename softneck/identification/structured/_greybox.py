@@ -86,8 +86,7 @@ class GreyBox:
         found = Found(problem, np.zeros(0), self.sensor_delay or 0, np.inf)
         said: dict[str, object] = {}
         try:
-            for found in problem.delayed(self.sensor_delay, self.evaluations, tell):  # noqa: B007
-                pass
+            found = problem.delayed(self.sensor_delay, self.evaluations, tell)
             parts = parts_of(self.body)
             if parts is None:
                 found, said = choose_parts(found, scaled, self.evaluations, tell)
@@ -96,10 +95,8 @@ class GreyBox:
         except KeyboardInterrupt:
             said["interrupted"] = INTERRUPTED
             if not found.x.size and tell.best is not None:
-                cost, x = tell.best
-                late = x[len(problem.numbers) :]  # the dead time, where it was searched
-                delay = round(float(late[0])) if late.size else found.delay
-                found = Found(problem, x[: len(problem.numbers)], delay, cost)
+                cost, x, delay = tell.best
+                found = Found(problem, x, round(delay), cost)
         if not np.isfinite(found.cost):
             raise DataError("no numbers of the grey box give a finite error; look for wild values in the recording.")
         model = _model(self, found.problem, scaled, found.delay, found.x)

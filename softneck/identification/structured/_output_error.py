@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from softneck.core import Matrix, Progress, Vector
+from softneck.core import Matrix, Progress, Vector, compute_once
 from softneck.robot import Robot
 from softneck.runtime import load_functions
 
@@ -189,20 +189,19 @@ class FitProblem:
                 parts.append(_MOTOR_WEIGHT * (M - m)[rows].ravel())
         return np.nan_to_num(np.concatenate(parts))
 
-    def delayed(self, delay: int | None, evaluations: int, tell: SearchProgress) -> Iterator[Found]:
-        """Yield the best fit so far; the sensor's dead time only shifts the output, and is searched as one number."""
+    def delayed(self, delay: int | None, evaluations: int, tell: SearchProgress) -> Found:
+        """Return the best fit; the sensor's dead time only shifts the output, and is searched as one number."""
+        # Of a robot it is asked for without optional parts and with them.
+        return compute_once(lambda: self._delayed(delay, evaluations, tell), self, delay, evaluations)
+
+    def _delayed(self, delay: int | None, evaluations: int, tell: SearchProgress) -> Found:
         start = np.array([number.encode(number.guess) for number in self.numbers])
         if delay is not None:
-            yield self.search(start, delay, evaluations, tell)
-            return
+            return self.search(start, delay, evaluations, tell)
         delays = self.delays()
         found, late = self._search(start, float(delays[0]), evaluations, tell, (min(delays), max(delays)))
-        best: Found | None = None
-        for delay in dict.fromkeys((int(np.floor(late)), int(np.ceil(late)))):
-            each = self.search(found, delay, _SHORT, tell)
-            if best is None or each.cost < best.cost:
-                best = each
-                yield best
+        nearest = dict.fromkeys((int(np.floor(late)), int(np.ceil(late))))
+        return min((self.search(found, delay, _SHORT, tell) for delay in nearest), key=lambda each: each.cost)
 
     def search(self, start: Vector, delay: int, evaluations: int, tell: SearchProgress) -> Found:
         """Return the numbers with the smallest error, by Levenberg-Marquardt from `start`."""
@@ -222,8 +221,9 @@ class FitProblem:
             scale = np.append(scale, _DELAY_SPREAD)
 
         def errors(x: Vector) -> Vector:
-            e = self.errors(x[:n], delay if delays is None else float(x[n]))
-            tell.see(0.5 * float(e @ e), x)
+            late = delay if delays is None else float(x[n])
+            e = self.errors(x[:n], late)
+            tell.see(0.5 * float(e @ e), x[:n], late)
             return e
 
         x = minimise(errors, start, Bounds(low, high, scale), evaluations)
@@ -274,13 +274,13 @@ class SearchProgress:
     def __init__(self, progress: Progress, expected: int) -> None:
         self.progress, self.expected, self.calls = progress, expected, 0
         self.what = ""
-        self.best: tuple[float, Vector] | None = None
+        self.best: tuple[float, Vector, float] | None = None
 
-    def see(self, cost: float, x: Vector) -> None:
+    def see(self, cost: float, x: Vector, delay: float) -> None:
         """Take note of one evaluation."""
         self.calls += 1
         if self.best is None or cost < self.best[0]:
-            self.best = (cost, x.copy())
+            self.best = (cost, x.copy(), delay)
         if self.calls % 20 == 1:
             self.progress(min(self.calls / self.expected, 0.99), f"{self.what}, loss {self.best[0]:.4g}")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,10 +11,11 @@ import numpy as np
 import pytest
 import statsmodels.api as sm
 
-from softneck.core import load
+from softneck.core import load, silent
 from softneck.identification import INFINITE, GreyBox, Model, validate
+from softneck.identification.models._fitting import ScaledData
 from softneck.identification.structured._greybox import INTERRUPTED, PARAMETERS
-from softneck.identification.structured._output_error import intervals
+from softneck.identification.structured._output_error import FitProblem, SearchProgress, intervals
 from softneck.identification.structured._parameters import RIGID
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
@@ -201,15 +203,26 @@ def test_its_free_run_is_the_one_that_was_fitted(fitted: Model, truth: np.ndarra
     np.testing.assert_allclose(free[200:, 2:5], M[200:], rtol=0, atol=1e-3)
 
 
-def test_ctrl_c_keeps_the_best_numbers_so_far(truth: np.ndarray) -> None:
+def test_dead_time_and_drive_of_a_recording_are_searched_once(truth: np.ndarray) -> None:
+    scaled = ScaledData.of(neck_of(truth, 300), amplitudes=False)
+    again = replace(scaled, data=replace(scaled.data))
+    assert again.drive is scaled.drive
+    found = FitProblem.of(scaled).delayed(None, 1, SearchProgress(silent, 1))
+    assert FitProblem.of(again).delayed(None, 1, SearchProgress(silent, 1)) is found
+    assert FitProblem.of(again).delayed(None, 2, SearchProgress(silent, 1)) is not found
+
+
+@pytest.mark.parametrize("delay", [2, None])
+def test_ctrl_c_keeps_the_best_numbers_so_far(truth: np.ndarray, delay: int | None) -> None:
     count = itertools.count()
 
     def impatient(done: float, _what: str) -> None:
         if next(count) == 3:
             raise KeyboardInterrupt
 
-    model = GreyBox(sensor_delay=2).fit(neck_of(truth, 600), progress=impatient)
+    model = GreyBox(sensor_delay=delay).fit(neck_of(truth, 600), progress=impatient)
     assert model.findings["interrupted"] == INTERRUPTED
+    assert model.findings["sensor_delay"] in ((delay,) if delay else range(1, 5))
 
 
 def test_it_bends_for_a_neck_that_is_none_of_its_kind_and_without_logged_motors() -> None:
