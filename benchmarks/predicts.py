@@ -8,10 +8,10 @@ computes what is not kept. Printed for each neck: the rank correlation (Spearman
 the truth, that of the hold-out alone, and the regret: the best kind's worst axis less that of the chosen model.
 Choices are kept in `build/predicts`; they are of the code that made them: use --fresh after a change.
 
-`--each`: how well the first figure that `identify KIND` prints predicts. Each kind is identified from 140 s of Eq. 22,
-and from these and 60 s of `mixed`. Printed: that figure and its part, what it expects of other motions, the hold-out,
-and the truth of this very model: its worst axis of steps, sine and rotation; then the share of neck x kind within 5
-points of it.
+`--each`: how well the first figure that `identify KIND` prints predicts: what it expects of other motions. Each kind is
+identified from 140 s of Eq. 22, and from these and 60 s of `mixed`. Printed: that figure, the same with factors of the
+other necks alone, the worst part, the hold-out, and the truth of this very model: its worst axis of steps, sine and
+rotation; then the share of neck x kind within 5 points of it.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.baseline import MODELS, Job, compute, recorded, records_of_tests, training
 from softneck.identification import INFINITE, Model, SetMembership, choose, identify, validate
+from softneck.identification.selection._examination import MISSING
 from softneck.signals import signal
 from tests.foreign_necks.kept import keep, kept_lines
 from tests.foreign_necks.necks import CHOOSING
@@ -116,34 +117,38 @@ def print_each(necks: list[str], kinds: list[str], seed: int, *, fresh: bool) ->
         kept.unlink(missing_ok=True)
     known = {tuple(line["job"]): line["found"] for line in kept_lines(kept)}
     for motions in (1, 2):
-        print(
-            f"\n{motions} motion(s)\n{'neck':9}{'kind':9}{'said':>6}{'expected':>17}{'hold-out':>10}{'truth':>7}  part"
-        )
-        table = []
-        for neck, kind in product(necks, kinds):
-            job = (neck, kind, motions)
+        for job in (found := [(neck, kind, motions) for neck, kind in product(necks, kinds)]):
             if job not in known:
                 known[job] = each(*job, seed)
                 keep(kept, {"job": job, "found": known[job]})
-            one = known[job]
-            said, worth = one["said"], one["worth"]
-            fit, expected, low, high = (
-                -100.0 if said[key] is None else said[key] for key in ("fit", "expected", "low", "high")
+        heads = "".join(f"{head:>10}" for head in ("by others", "worst", "hold-out", "truth"))
+        print(f"\n{motions} motion(s)\n{'neck':9}{'kind':9}{'expected':>16}{heads}")
+        table = []
+        for neck, kind, _ in found:
+            one = known[neck, kind, motions]
+            fit, expected, low, high = (_number(one["said"][key]) for key in ("fit", "expected", "low", "high"))
+            others = [known[job] for job in found if job[0] != neck and MISSING.get(job[1]) == MISSING.get(kind)]
+            factors = [(100.0 - other["worth"]) / (100.0 - _number(other["said"]["fit"])) for other in others]
+            elsewhere = 100.0 - (np.median(factors) if factors else 1.0) * (100.0 - fit)
+            hold_out, worth = one["least"]["hold-out"], one["worth"]
+            table.append(
+                [*(abs(said - worth) <= NEAR for said in (expected, elsewhere, fit, hold_out)), low <= worth <= high]
             )
-            table.append([abs(other - worth) for other in (fit, expected, one["least"]["hold-out"])])
-            table[-1].append(float(low <= worth <= high))
             parts = ", ".join(f"{part} {value:.0f}" for part, value in one["least"].items())
             print(
-                f"{neck:9}{kind:9}{fit:6.1f}{f'{expected:.1f} ({low:.0f}..{high:.0f})':>17}"
-                f"{one['least']['hold-out']:10.1f}{worth:7.1f}  {said['part']}; {parts}; {one['seconds']:.0f} s",
+                f"{neck:9}{kind:9}{f'{expected:.1f} ({low:.0f}..{high:.0f})':>16}{elsewhere:10.1f}{fit:10.1f}"
+                f"{hold_out:10.1f}{worth:10.1f}  {parts}; {one['seconds']:.0f} s",
                 flush=True,
             )
-        found = np.array(table)
-        near = [f"{100.0 * share:.0f} %" for share in (found[:, :3] <= NEAR).mean(axis=0)]
+        near = [f"{share:.0f} %" for share in 100.0 * np.mean(table, axis=0)]
         print(
-            f"within {NEAR:g} points of the truth, of {len(table)}: the worst part {near[0]}, what is expected "
-            f"{near[1]}, the hold-out {near[2]}; the interval holds {100.0 * found[:, 3].mean():.0f} % of the truths"
+            f"within {NEAR:g} points of the truth, of {len(table)}: what is expected {near[0]}, by factors of other "
+            f"necks {near[1]}, the worst part {near[2]}, the hold-out {near[3]}; the interval holds {near[4]} of them"
         )
+
+
+def _number(said: float | None) -> float:
+    return -100.0 if said is None else said
 
 
 def _rank_correlation(a: list[float], b: list[float]) -> float:

@@ -186,7 +186,7 @@ class KalmanSettings:
         usual = find_sensor(self.sensor).delay
         delay, gyro = own._delays(float(robot.require("delay_s", _NAME_IN_MESSAGES) if usual is None else usual))
         noise, sensor = own.levels(robot, scaling, period)
-        recorded = max(model.findings.get("sensor_noise", [0.0]))
+        recorded = max(model.findings.get("sensor", {}).get("noise_std", [0.0]))
         if recorded > noise[0] and sensor in ("paper", "robot"):
             noise, sensor = (recorded, *noise[1:]), "recording"
         return NonlinearObserver(

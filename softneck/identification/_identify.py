@@ -139,7 +139,8 @@ def identify(
     """Fit a model of `kind` to the first part of each run and validate it on the rest.
 
     The command `softneck identify KIND` does the same. `findings["examination"]` and the first line of `summary()` give
-    the worst fit on what was left out: the rest, and parts of the first part that the kind is trained again without.
+    the fit to be expected on other motions, and the worst on what was left out: the rest, and parts of the first part
+    that the kind is trained again without.
 
     Args:
         kind: name in the table of kinds: "rls", "oe", "nlsm", "nn", ...; "auto" compares all of them and returns the

@@ -113,11 +113,11 @@ def test_files_from_before_take_jumps_as_they_come_and_no_timing_error(
 
 def test_its_sensor_is_at_least_as_noisy_as_the_recordings(play: Model) -> None:
     poor, good = (
-        replace(play, findings={**play.findings, "sensor_noise": [math.radians(0.01), math.radians(noise)]})
+        replace(play, findings={**play.findings, "sensor": {"noise_std": [math.radians(0.01), math.radians(noise)]}})
         for noise in (0.25, 0.02)
     )
     # White noise of 0.05 deg in 3,000 rows of two outputs, by medians: to 4 %.
-    assert max(play.findings["sensor_noise"]) == pytest.approx(NOISE, rel=0.1)
+    assert max(play.findings["sensor"]["noise_std"]) == pytest.approx(NOISE, rel=0.1)
     assert (designed(OURS, poor).noise[0], designed(OURS, poor).sensor) == (math.radians(0.25), "recording")
     assert (designed(OURS, good).noise[0], designed(OURS, good).sensor) == (NOISE, "paper")
     given = (designed(settings, poor).noise[0] for settings in (PLAIN, KalmanSettings(sensor="mpu9250")))

@@ -190,7 +190,7 @@ def fitted_model(
         sample_time=recording.sample_time,
         arrays=arrays,
         settings=asdict(settings),
-        findings={**findings, **trained_set_points(recording), "sensor_noise": sensor_noise(recording)},
+        findings={**findings, **trained_set_points(recording), "sensor": {"noise_std": sensor_noise(recording)}},
         training_rows=row_hashes(recording),
         robot=recording.robot,
     )

@@ -434,15 +434,17 @@ def _input_rows(run: Recording, source: str, *, outputs: bool = True) -> Matrix:
 
 
 def _examined_lines(found: Mapping[str, Any], unit: str) -> list[str]:
-    """Return the line of a summary on the examination: the worst fit, and the one to be expected."""
+    """Return the line of a summary on the examination: the fit to be expected, and the worst one."""
     if not found:
         return []
-    worst = f"simulation fit {percent(found['fit'])} % at its worst ({found['part']}, {found['output']})"
+    worst = f"{percent(found['fit'])} % at its worst ({found['part']}, {found['output']})"
     if found["low"] is None:
-        return [worst]
-    expected = f"on other motions {found['expected']:.0f} % ({found['low']:.0f} to {found['high']:.0f} %)"
+        return [f"simulation fit {worst}"]
+    expected = (
+        f"simulation fit on other motions {found['expected']:.0f} % ({found['low']:.0f} to {found['high']:.0f} %)"
+    )
     lacks = f": one motion is too little to say more; {found['record']}" if found.get("record") else ""
-    lines = [f"{worst}; {expected}{lacks}"]
+    lines = [f"{expected}, {worst}{lacks}"]
     if bounds := found.get("bounds"):
         least, wide = min(bounds["held_pct"].values()), max(bounds["width"].values())
         kept = "held" if least >= _BOUND_PCT else f"are no {_BOUND_PCT} % bounds: they held"

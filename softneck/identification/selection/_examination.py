@@ -1,4 +1,4 @@
-"""One examination for every kind: what a training did not see, and the worst of these fits, which is the score.
+"""One examination for every kind: the worst fit on what a training did not see, and what this says of other motions.
 
 A model that is right on later rows of its own motion may be far off on another one. So the kind is trained again
 without the largest and the fastest motions and without one run after the other, and judged on these; where its model
@@ -36,8 +36,9 @@ SHORT: dict[str, dict[str, Any]] = {
 # Kinds that are trained again: in at most twice the time of their own training. `guarded` holds several models.
 AGAIN = ("rls", "oe", "greybox", "play", "nlsm", "nn")
 # What is missing to 100 % on other motions over what is missing in the worst part, of one motion and of several:
-# medians over six necks (`benchmarks/predicts.py --each`). In one motion nothing is held, which misleads `nlsm`, and
-# slow parts of the physics, which `greybox` may lack, do not show; `play` does worse without a motion than with all.
+# medians over six necks; those of five predict the sixth as well (`benchmarks/predicts.py --each`). In one motion
+# nothing is held, which misleads `nlsm`, and slow parts of the physics, which `greybox` may lack, do not show; `play`
+# does worse without a motion than with all.
 MISSING = {"nlsm": (1.3, 1.0), "greybox": (1.3, 1.0), "play": (1.0, 0.75)}
 # How far the truth may lie above and below [points]: with two motions all of 30 (six necks, five kinds) were inside.
 HALF_INTERVAL = 12.0
