@@ -39,6 +39,8 @@ LEVEL = 0.95
 # Last part of each run, held out from the fit; rows of each run that are used at most [s of a neck's time]: all of
 # `mixed`, whose parts are different motions.
 _HELD_OUT, _MOST_S = 0.25, 150.0
+# Rows before those held out, from which they are simulated [s of a neck's time].
+_LEAD_S = 20.0
 # Segments of held-out motions: usual, shortest (10, 2.5 time constants) [s of a neck's time], least rows of one.
 _SEGMENT_S, _LEAST_SEGMENT_S, _LEAST_ROWS = 2.0, 0.5, 20
 # Factors on the deviations of the fit, of which the sharpest that explain the held-out motions are taken.
@@ -199,7 +201,7 @@ def make_draws(
     continuous ranked probability score (Gneiting and Raftery 2007, J. Am. Stat. Assoc. 102:359); the factor on the
     deviations of its numbers is the smallest within one standard error of the best (Breiman et al. 1984, sec. 3.4).
     What the nearest draw leaves over there, less the sensor's noise, is the disturbance; it is raised until the band
-    covers `LEVEL` of the samples at every amplitude.
+    covers `LEVEL` of the samples at every amplitude. Simulations begin 20 s of a neck's time before the last quarters.
 
     Args:
         recordings: of one robot and sample time, the payload as a channel.
@@ -215,9 +217,9 @@ def make_draws(
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     whole = concatenate(recordings)
     second = ScaledData.of(whole).scaling.second
-    train, held = _split(whole, second)
+    train, held, leads = _split(whole, second)
     sources = _sources(train, lambda done, text: progress(0.7 * done, f"draws: {text}"))
-    motions = _Motions.of(held, sources[0].model, second)
+    motions = _Motions.of(held, sources[0].model, second, leads)
     tried: list[tuple[Vector, Source, float, np.ndarray]] = []
     for number, (source, factor) in enumerate(product(sources, _FACTORS)):
         progress(0.7 + 0.15 * number / (len(sources) * len(_FACTORS)), f"draws: deviations times {factor:g}")
@@ -267,28 +269,32 @@ def _sources(train: Recording, progress: Progress) -> list[Source]:
         return [PlayDraws.fit(train, progress=progress)]
 
 
-def _split(recording: Recording, second: float) -> tuple[Recording, Recording]:
-    """Return the rows to fit and to hold out of each run."""
-    most = round(_MOST_S * second / recording.sample_time)
-    train, held = [], []
+def _split(recording: Recording, second: float) -> tuple[Recording, Recording, list[int]]:
+    """Return the rows to fit and to hold out of each run, and how many of those held out lead in.
+
+    These are simulated and not judged: before them nothing is known of a robot's hysteresis.
+    """
+    most, lead = (round(length * second / recording.sample_time) for length in (_MOST_S, _LEAD_S))
+    train, held, leads = [], [], []
     for run in recording.runs():
         rows = min(len(run), max(most, 8 * WARM_UP))
         edge = round((1.0 - _HELD_OUT) * rows)
         if edge > 2 * WARM_UP and rows - edge > WARM_UP + _LEAST_ROWS:
             train.append(run.rows(0, edge))
-            held.append(run.rows(edge, rows))
+            leads.append(min(edge, max(lead, WARM_UP)))
+            held.append(run.rows(edge - leads[-1], rows))
     if not train:
         raise DataError(
             f"no run has {8 * WARM_UP} rows, of which the last quarter could be held out from the draws; record longer."
         )
-    return concatenate(train), concatenate(held)
+    return concatenate(train), concatenate(held), leads
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Motions:
     """Held-out motions in segments.
 
-    recording, model: to simulate; outputs: (rows, outputs) measured; groups: (rows,) segment, -1 in the warm-up;
+    recording, model: to simulate; outputs: (rows, outputs) measured; groups: (rows,) segment, -1 in what leads in;
     motion: (segments,) largest motion of an output [SI]; classes: (segments,) of amplitude; noise: (outputs,) standard
     deviation of the sensor [SI], which loops add to every draw: it is no disturbance.
     """
@@ -302,14 +308,15 @@ class _Motions:
     noise: Vector
 
     @classmethod
-    def of(cls, held: Recording, model: Model, second: float) -> _Motions:
+    def of(cls, held: Recording, model: Model, second: float, leads: Sequence[int]) -> _Motions:
         usual, least = (round(length * second / held.sample_time) for length in (_SEGMENT_S, _LEAST_SEGMENT_S))
         runs, groups, first = held.runs(), [], 0
         # One run that is shorter than a segment has two halves.
-        length = max(_LEAST_ROWS, usual if len(held) > usual else max(least, (len(held) + 1) // 2))
-        for run in runs:
-            number = first + np.arange(len(run)) // length
-            number[:WARM_UP] = -1
+        rows = len(held) - sum(leads)
+        length = max(_LEAST_ROWS, usual if rows > usual else max(least, (rows + 1) // 2))
+        for run, lead in zip(runs, leads, strict=True):
+            number = first + (np.arange(len(run)) - lead) // length
+            number[:lead] = -1
             first = int(number.max(initial=first)) + 1
             groups.append(number)
         group, y = np.concatenate(groups), held.outputs

@@ -263,13 +263,13 @@ def test_a_noisier_sensor_is_no_larger_disturbance(made: Callable[..., Draws], r
     found, added = made(), np.array([0.004, 0.008])
     assert found.noise.shape == added.shape
     rng = np.random.default_rng(3)
-    held = _draws._split(_draws.concatenate(recordings), 1.0)[1]
+    _, held, leads = _draws._split(_draws.concatenate(recordings), 1.0)
     noisy = dict(
         zip(held.robot.outputs.names, (held.outputs + added * rng.normal(size=held.outputs.shape)).T, strict=True)
     )
     loud = replace(held, channels={**held.channels, **noisy})
     draws = [{name: values[k] for name, values in found.arrays.items()} for k in range(20)]
-    before, after = (_draws._Motions.of(each, found.model, 1.0) for each in (held, loud))
+    before, after = (_draws._Motions.of(each, found.model, 1.0, leads) for each in (held, loud))
     # 450 rows tell a deviation to 1 / sqrt(900) = 3 %, fourth differences to about three times that.
     np.testing.assert_allclose(after.noise, np.hypot(before.noise, added), rtol=0.15)
     Y = before.simulate(draws)
@@ -289,8 +289,8 @@ def test_draws_of_a_neck_are_grey_boxes_that_cover_a_new_recording() -> None:
     numbers = np.array([model.arrays["neck"] for model in found.for_certificate()])
     assert (numbers.std(axis=0) > 0.0).sum() >= 12  # all but those that have no meaning here or are held at a bound
     new = record(signal("aprbs", duration=20.0, seed=7), neck, seed=3)
-    _, held = _draws._split(new, 1.0)
-    motions = _draws._Motions.of(held, found.model, 1.0)
+    _, held, leads = _draws._split(new, 1.0)
+    motions = _draws._Motions.of(held, found.model, 1.0, leads)
     Y = motions.simulate([{name: values[k] for name, values in found.arrays.items()} for k in range(20)])
     for row in motions.coverage(Y, found.share, found.keep):
         # A tenth less than the level: twenty draws have a narrower range than the forty of the calibration.
@@ -303,16 +303,18 @@ def test_draws_of_a_neck_are_grey_boxes_that_cover_a_new_recording() -> None:
 )
 def test_one_short_run_of_a_slow_robot_has_two_segments_at_least(second: float, held: int, rows: int) -> None:
     """A tank of 208 s time constant at 4 s a sample: 256 rows held out, where a usual segment has 417."""
-    motions = _draws._Motions.of(neck_recording(held), Model(kind="rls", sample_time=0.02, arrays={}), second)
+    motions = _draws._Motions.of(
+        neck_recording(25 + held), Model(kind="rls", sample_time=0.02, arrays={}), second, [25]
+    )
     found, counts = np.unique(motions.groups[motions.groups >= 0], return_counts=True)
     assert found.tolist() == [*range(-(-held // rows))]
-    assert counts[0] == rows - _draws.WARM_UP
+    assert counts[0] == rows
 
 
 def test_a_run_of_less_than_a_segment_is_to_be_longer() -> None:
     # The shortest segment has 2.5 time constants of 2.4 s: 300 rows of 20 ms.
     with pytest.raises(DataError, match="no two segments with outputs; record longer"):
-        _draws._Motions.of(neck_recording(256), Model(kind="rls", sample_time=0.02, arrays={}), 12.0)
+        _draws._Motions.of(neck_recording(256), Model(kind="rls", sample_time=0.02, arrays={}), 12.0, [0])
 
 
 # -- what is held out -------------------------------------------------------------------------------------------------
@@ -329,23 +331,23 @@ RLS = Model(kind="rls", sample_time=0.02, arrays={})
 
 
 def test_segments_are_parts_of_a_run_by_the_largest_motion_of_an_output() -> None:
-    """Waves of 50 rows in segments of two seconds; runs begin a segment of their own, without their first 25 rows."""
+    """Waves of 50 rows in segments of two seconds; runs begin a segment of their own, behind what leads in."""
     sizes = np.array([0.2, 0.2 * 0.59, 0.2 * 0.61, 0.2 * 0.24, 0.2 * 0.26])
-    lengths = [200, 250]
-    number = np.concatenate([np.arange(200) // 100, 2 + np.arange(250) // 100])
-    wave = np.sin(2.0 * np.pi * np.arange(450) / 50.0)
+    lengths, leads = [250, 300], [50, 50]
+    number = np.concatenate([np.full(50, -1), np.arange(200) // 100, np.full(50, -1), 2 + np.arange(250) // 100])
+    wave = np.sin(2.0 * np.pi * np.arange(550) / 50.0)
     y = np.column_stack([0.01 * wave, sizes[number] * wave])
     y[130, 0] = np.nan  # a row that misses one output
-    found = _draws._Motions.of(held_out(lengths, y), RLS, 1.0)
+    found = _draws._Motions.of(held_out(lengths, y), RLS, 1.0, leads)
     expected = number.copy()
-    expected[[*range(25), *range(200, 225), 130]] = -1
+    expected[130] = -1
     np.testing.assert_array_equal(found.groups, expected)
-    # 25 rows are half a wave, and 50 rows at least are left of each segment.
+    # Each segment has a whole wave at least, whose 50 rows miss its crest by half a row at most.
     np.testing.assert_allclose(found.motion, sizes, rtol=3e-3)
     assert found.classes.tolist() == [2, 1, 2, 0, 1]
     assert found.noise.shape == (2,)
     with pytest.raises(DataError, match="no two segments"):
-        _draws._Motions.of(held_out([450], np.where(np.arange(450)[:, None] < 100, y, np.nan)), RLS, 1.0)
+        _draws._Motions.of(held_out([550], np.where(np.arange(550)[:, None] < 100, y, np.nan)), RLS, 1.0, [25])
 
 
 @pytest.mark.parametrize(
@@ -361,10 +363,13 @@ def test_the_last_quarter_of_each_run_is_held_out(lengths: list[int], second: fl
         with pytest.raises(DataError, match="no run has 200 rows"):
             _draws._split(recording, second)
         return
-    train, held = _draws._split(recording, second)
-    assert [(len(a), len(b)) for a, b in zip(train.runs(), held.runs(), strict=True)] == (parts or [(150, 50)])
+    train, held, leads = _draws._split(recording, second)
+    each = list(zip(train.runs(), held.runs(), leads, strict=True))
+    assert [(len(a), len(b) - lead) for a, b, lead in each] == (parts or [(150, 50)])
+    # 20 s of a neck's time lead in where there are as many, and no fewer rows than a simulation takes to start.
+    assert leads == [min(len(a), max(round(1000 * second), 25)) for a, _, _ in each]
     np.testing.assert_array_equal(train.runs()[0].outputs, recording.runs()[0].outputs[: len(train.runs()[0])])
-    last, rows = [run for run in recording.runs() if len(run) > 150][-1], len(train.runs()[-1])
+    last, rows = [run for run in recording.runs() if len(run) > 150][-1], len(train.runs()[-1]) - leads[-1]
     np.testing.assert_array_equal(held.runs()[-1].outputs, last.outputs[rows : rows + len(held.runs()[-1])])
 
 
@@ -553,7 +558,7 @@ def test_the_making_of_draws_says_how_far_it_is_and_refuses_what_has_no_simulati
     monkeypatch.setattr(_draws, "_CALIBRATION_DRAWS", 4)
     make_draws(recordings, count=2, progress=lambda share, _: said.append(share))
     assert said == pytest.approx([0.0, 0.7, 0.7, 0.775, *(0.85 + 0.15 * np.arange(69) / 69)])
-    monkeypatch.setattr(_draws._Motions, "simulate", lambda *_: np.full((4, 450, 2), np.nan))
+    monkeypatch.setattr(_draws._Motions, "simulate", lambda own, _: np.full((4, *own.outputs.shape), np.nan))
     with pytest.raises(DataError, match="no draw has a finite simulation"):
         make_draws(recordings, count=2)
 
