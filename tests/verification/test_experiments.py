@@ -380,3 +380,20 @@ def test_an_experiment_in_the_units_of_its_robot() -> None:
     for hunting, rests in ((0.99, True), (1.0, True), (1.01, False), (math.nan, False), (math.inf, False)):
         case = Experiment(loop(size=2.0), "both", "delay", 0.1, (0.0,))
         assert case.comes_to_rest(2.0 * deg * hunting) is rests
+
+
+@pytest.mark.parametrize("samples", [1, 5])
+def test_what_a_loop_may_be_set_to_is_bounded_and_only_the_seed_of_its_noise_is_whole(samples: int) -> None:
+    """At rest nothing is changed: gains of one, no delay, disturbance or noise; delays fit the buffer."""
+    block, _, _ = scale_loop_gain(pi().block(), None, samples=samples)
+    ports = {port.name: port for port in block.parameters}
+    assert [name for name, port in ports.items() if port.integer] == ["noise_seed"]
+    assert {name: port.start or 0.0 for name, port in ports.items()} == {
+        name: 1.0 if name.startswith("gain_") else 0.0 for name in ports
+    }
+    assert {port.minimum for name, port in ports.items() if name != "noise_seed"} == {0.0}
+    kept = float(block.arrays[1][0])
+    assert kept == (_experiments._BUFFER_SAMPLES - 2) * samples + 2
+    ends = {name: port.maximum for name, port in ports.items() if port.maximum is not None}
+    assert ends == {"delay_pitch": kept - 2.0, "delay_roll": kept - 2.0, "keep": 1.0}
+    assert max(_experiments.DELAY_SCAN) * samples <= kept - 2.0
