@@ -567,8 +567,8 @@ def test_equal_loops_run_once_and_every_other_attempt_limit_or_draw_runs_its_own
     monkeypatch.setattr(_drawn, "directions_of", lambda _: None)
     monkeypatch.setattr(ToldDraws, "model", None, raising=False)
 
-    def run(limit: float = 10.0, attempt: int = 1, seed: int = 7, **more: Any) -> Drawn:
-        asked = make_requirements({"sim": {"decides": True, **more}, "require": {"sim.overshoot_pct": {"max": limit}}})
+    def run(limit: float = 10.0, attempt: int = 1, seed: int = 7, bound: str = "max", **more: Any) -> Drawn:
+        asked = make_requirements({"sim": {"decides": True, **more}, "require": {"sim.overshoot_pct": {bound: limit}}})
         draws: Any = ToldDraws({"motion": [0.4], "payload_kg": [0.0]}, seed)
         return run_drawn(
             "once", draws, pi().block(), asked, order="sequential", observer=None, attempt=attempt,
@@ -580,13 +580,14 @@ def test_equal_loops_run_once_and_every_other_attempt_limit_or_draw_runs_its_own
     again = run()
     assert (len(runs), again.statement(), again.conditions) == (3, first.statement(), first.conditions)
     assert run(limit=2.0).failed == (0, 1, 2)
+    assert run(limit=2.0, bound="min").failed == ()
     assert (run(attempt=2).attempt, run(seed=8).draws.seed) == (2, 8)
-    assert len(runs) == 12
+    assert len(runs) == 15
     # What the user stated changes what is told of equal loops.
     payloads = make_requirements({}).sim["payloads_kg"]
     assert "sim" in run(payloads_kg=payloads).unreached
     assert not again.unreached
-    assert len(runs) == 12
+    assert len(runs) == 15
 
 
 def test_each_kind_of_margin_is_bisected_on_the_draws_that_swing_most(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -474,7 +474,9 @@ def test_the_noise_of_a_rounding_sensor_is_no_less_than_its_steps_tell(step: flo
 def test_draws_of_one_certificate_are_the_fewest_that_tell_95_percent_with_95_percent_confidence() -> None:
     """None of n draws fails with probability 0.95^n where 5 % of such plants do (Wilks 1941)."""
     assert 0.95**_draws.DRAWS <= 0.05 < 0.95 ** (_draws.DRAWS - 1)
-    assert inspect.signature(make_draws).parameters["count"].default == _draws.SEARCH_DRAWS == _draws.DRAWS
+    defaults = inspect.signature(make_draws).parameters
+    assert defaults["count"].default == _draws.SEARCH_DRAWS == _draws.DRAWS
+    assert defaults["seed"].default == 0  # as every other seed
 
 
 @pytest.mark.parametrize(

@@ -267,12 +267,22 @@ def test_a_plant_more_never_makes_a_family_smaller_and_a_window_changes_nothing(
     assert 0.5 < family.covered("pitch") <= 1.0 + 1e-9
     # The farthest decides, not the mean; a sample that is not used does not.
     poor = replace(base, samples=np.vstack([base.samples, base.samples[0] * [3.0, 1.0, 1.0]]), used=np.ones(3))
-    assert replace(family, axes={"pitch": poor, "roll": base}).covered("pitch") > 2.0
+    farthest = replace(poor, samples=poor.samples[-1:], used=np.ones(1))
+    alone, among = (replace(family, axes={"pitch": one, "roll": base}).covered("pitch") for one in (farthest, poor))
+    assert among == alone > 2.0
     unused = replace(poor, used=np.array([1.0, 1.0, 0.0]))
     assert replace(family, axes={"pitch": unused, "roll": base}).covered("pitch") == family.covered("pitch")
     for few in ([middle], [middle, local("window"), local("window")]):
         with pytest.raises(DataError, match=r"only 1 local models say enough \(3 windows do not\)"):
             axis_of(*few)
+
+
+def test_a_weight_covers_the_samples_between_the_lines_of_a_coarse_grid_too() -> None:
+    coarse = np.geomspace(0.05, np.pi / TS, 5)
+    found = FamilySettings()._axis("pitch", [local(), local(late=2.0)], coarse, TS, 0)
+    fine = np.geomspace(coarse[0], coarse[-1], 5 * coarse.size)
+    W = np.abs(np.polyval(found.weight[0], 1j * fine) / np.polyval(found.weight[1], 1j * fine))
+    assert (relative_errors(found.samples, found.nominal, fine, TS) <= W * (1.0 + 1e-9)).all()
 
 
 @pytest.mark.parametrize("order", [1, 2, 3])
@@ -327,3 +337,20 @@ def test_a_family_file_with_one_number_that_is_none_is_refused(key: str, bad: fl
         load(tmp_path / "f.npz", role="family")
     family.save(tmp_path / "g.npz")
     assert load(tmp_path / "g.npz", role="family").axes["roll"].used.tolist() == axis.used.tolist()
+
+
+@pytest.mark.parametrize("key", ["samples", "nominal", "box"])
+@pytest.mark.parametrize(("column", "bad"), [(1, 0.0), (1, -1.0), (2, -0.01)])
+def test_a_family_file_with_one_pole_or_dead_time_that_cannot_be_is_refused(
+    key: str, column: int, bad: float, tmp_path: Path
+) -> None:
+    family = small_family()
+    axis = family.axes["roll"]
+    values = getattr(axis, key).copy()
+    values[..., column].flat[-1] = bad
+    replace(family, axes={**family.axes, "roll": replace(axis, **{key: values})}).save(tmp_path / "f.npz")
+    with pytest.raises(FileFormatError, match=f"`roll_{key}` is not of poles above and dead times from zero"):
+        load(tmp_path / "f.npz", role="family")
+    # One that was not tested against data has no weight that a recording could exceed.
+    with pytest.raises(DataError, match="was not tested against data"):
+        family.invalidated_by([], [])
