@@ -180,7 +180,12 @@ class Search:
         self._refine(self.levels, finals)
         if finals:
             last = [item for item in self.sort_candidates() if item.level == self.levels[-1]]
-            self._judge(best_of_kinds(last)[:finals], "margins", 0)
+            self._judge_finals(best_of_kinds(last)[:finals])
+
+    def _judge_finals(self, items: Sequence[Candidate]) -> None:
+        """Judge the first, and those that are better still: more loops improve no value, so the others cannot win."""
+        self._judge(items[:1], "margins", 0)
+        self._judge([item for item in items[1:] if self.cost(item) < self.cost(items[0])], "margins", 0)
 
     def sort_candidates(self) -> list[Candidate]:
         """Return all candidates with metrics, the best first."""

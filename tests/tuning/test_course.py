@@ -99,14 +99,14 @@ def test_a_search_ends_nearer_to_what_is_wanted_than_it_begins(monkeypatch: pyte
     assert costs[-1] < 0.995
 
 
-def test_what_a_search_says_of_its_course_only_grows_and_ends_with_its_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_search_says_of_its_course_only_grows_within_its_budget(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[tuple[float, str]] = []
     found = searched(monkeypatch, 40, tell=lambda *told: said.append(told))
     shares = [share for share, _ in said]
     assert shares == sorted(shares)
-    # With each judgement, also within a generation.
-    assert set(shares) == {done / 40 for done in range(1, 41)}
-    assert len(found.spent) == 40
+    # With each judgement, also within a generation; of the four final candidates those that cannot win are left out.
+    assert set(shares) == {done / 40 for done in range(1, len(found.spent) + 1)}
+    assert 37 <= len(found.spent) <= 40
     assert said[0][1] == "nothing yet"
     assert said[-1][1].startswith(f"best {found.sort_candidates()[0].kind}, rise")
 

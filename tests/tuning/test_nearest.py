@@ -35,6 +35,11 @@ def failed(metric: str, value: float | None, asked: TuneRequirements = ASKED) ->
     return Verdict(bound(metric, asked), value, False, {})
 
 
+def told(failing: list[Verdict]) -> Any:
+    """Return a verification that no draws were run for."""
+    return SimpleNamespace(failed=failing, evidence=SimpleNamespace(drawn=[]))
+
+
 def candidate(**metrics: float) -> Candidate:
     named = {name.replace("__", "."): value for name, value in metrics.items()}
     return Candidate("pi", {}, np.zeros(1), "all", named)
@@ -108,7 +113,7 @@ def test_what_fails_is_said_of_the_controller_that_is_written(values: dict[str, 
     ]
     best = Candidate(kind="pi", settings={}, x=np.zeros(0), metrics=values)
     found: Any = SimpleNamespace(
-        holds=False, best=best, binding="track.circle_rms_deg", nearest=3.7, verification=SimpleNamespace(failed=[]),
+        holds=False, best=best, binding="track.circle_rms_deg", nearest=3.7, verification=told([]),
         task=SimpleNamespace(bounds=bounds, tested=False, asked=SimpleNamespace(bounds=bounds)),
     )  # fmt: skip
     assert failing_requirement(found) == said
@@ -127,7 +132,7 @@ def test_what_was_not_computed_is_said_first_and_no_limit_is_said_to_make_it_hol
     best = Candidate("adaptive", {}, np.zeros(0), "all", {"step.load_rms_deg": 0.5, "step.rise_s": 0.52})
     found: Any = SimpleNamespace(
         holds=False, best=best, binding=binding, nearest=nearest, evaluations=6,
-        verification=SimpleNamespace(failed=[failed("step.load_rms_deg", 3.0), *unknown]),
+        verification=told([failed("step.load_rms_deg", 3.0), *unknown]),
         task=SimpleNamespace(bounds=bounds, tested=False, asked=SimpleNamespace(bounds=bounds)),
     )  # fmt: skip
     said = failing_requirement(found)

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from softneck.core import KINDS, CheckFailedError, DataError, SettingsError, metric_of, resolve
 from softneck.loop import LoopResult, RobotReference
@@ -943,10 +945,34 @@ def test_a_search_is_led_by_what_it_aims_at_and_its_finals_are_of_each_kind(monk
         search.candidates[kind, str(number)] = of_kind(kind, value, number=number)
     search.candidates["a", "low"] = of_kind("a", 0.0, "linear")
     monkeypatch.setattr(Search, "_refine", lambda *_: None)
-    monkeypatch.setattr(Search, "_judge", lambda _, items, level, left: judged.append((items, level, left)))
+    monkeypatch.setattr(Search, "_judge_finals", judged.append)
     search._finish(2)
-    [(items, level, left)] = judged
-    assert ([each.metrics["m"] for each in items], level, left) == ([0.1, 0.4], "margins", 0)
+    assert [each.metrics["m"] for each in judged[0]] == [0.1, 0.4]
+    search._finish(0)
+    assert len(judged) == 1
+
+
+@given(st.lists(st.tuples(st.floats(0.1, 0.9), st.floats(0.0, 2.0)), min_size=1, max_size=6))
+def test_final_candidates_that_are_left_out_could_not_win(values: list[tuple[float, float]]) -> None:
+    """The best is the same as if all were judged, and so is its value: more loops only add to a cost."""
+    search, judged = searching("a", own={"p": 1}), list[Any]()
+    items = [of_kind("a", before, number=k) for k, (before, _) in enumerate(sorted(values))]
+    added = [more for _, more in sorted(values)]
+
+    def judge(some: Any, level: str, reserved: int) -> None:
+        assert (level, reserved) == ("margins", 0)
+        for item in some:
+            judged.append(item)
+            item.metrics["m"] += added[items.index(item)]
+
+    all_of_them = min(before + more for before, more in zip((one.metrics["m"] for one in items), added, strict=True))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(search.__class__, "_judge", lambda _, *given: judge(*given))
+        search._judge_finals(items)
+    assert min(item.metrics["m"] for item in judged) == all_of_them
+    assert judged[0] is items[0]
+    # Those that are worse than the first before their judgement have none.
+    assert all(item.metrics["m"] >= items[0].metrics["m"] for item in items if item not in judged)
 
 
 @pytest.mark.parametrize("tested", [True, False])
@@ -998,6 +1024,7 @@ def test_a_search_judges_starts_generations_neighbours_and_finals_within_its_bud
     )
     monkeypatch.setattr(Search, "_sample", lambda _, space, __: [of_kind(space.kind, 0.5, "", k) for k in range(3)])
     monkeypatch.setattr(Search, "_refine", lambda _, levels, finals: said.append(("refine", levels, finals)))
+    monkeypatch.setattr(Search, "_judge_finals", lambda _, items: said.append(("margins", len(items))))
     best = [of_kind("a", 0.1 * k) for k in range(5)] + [of_kind("a", 0.0, "linear")]
     monkeypatch.setattr(Search, "sort_candidates", lambda _: best)
     search.run()
@@ -1014,7 +1041,7 @@ def test_a_search_judges_starts_generations_neighbours_and_finals_within_its_bud
     assert all(item[2] == finals for item in said if item[0] in levels)
     assert ("refine", levels, finals) in said
     # Margins by experiment of the best that were judged as far as any; they may take all that is left.
-    assert (said[-1] == ("margins", finals, 0)) is bool(finals)
+    assert (said[-1] == ("margins", finals)) is bool(finals)
 
 
 @pytest.mark.parametrize(("budget", "level"), [(500, "all"), (9, "all"), (500, "linear")])
@@ -1334,10 +1361,13 @@ def test_a_search_that_resumes_judges_its_starts_and_neighbours_within_its_budge
         Search, "_candidate", lambda self, space, _: self.candidates.setdefault(space.kind, made[space.kind])
     )
     monkeypatch.setattr(Search, "_refine", lambda _, levels, finals: said.append(("near", list(levels), finals)))
+    monkeypatch.setattr(
+        Search, "_judge_finals", lambda _, items: said.append(("margins", sorted(item.kind for item in items)))
+    )
     search.resume([of_kind("b", 1.0), of_kind("a", 2.0)])
     finals = 0 if budget == 3 else 4
     begun = [(level, ["a", "b"], finals) for level in LEVELS[:-1]] + [("near", list(LEVELS[:-1]), finals)]
-    assert said == begun + [("margins", ["a", "b"], 0)] * (finals > 0)
+    assert said == begun + [("margins", ["a", "b"])] * (finals > 0)
 
 
 @pytest.mark.parametrize("observed", [True, False])
