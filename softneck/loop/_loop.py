@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
 
 from softneck.core import ReprMixin, SettingsError, SoftneckError, Vector, require_one_of, require_positive
 from softneck.robot import Robot
-from softneck.runtime import Block, Port, load_runtime
+from softneck.runtime import Block, Port, State, load_runtime
 
 from ._faults import Fault
 from ._references import Reference
@@ -54,6 +55,14 @@ class Part(Protocol):
         ...
 
 
+def _initial_state(block: Block, parameters: tuple[tuple[str, float], ...]) -> State:
+    return block.initial_state(**dict(parameters))
+
+
+# Of a search and its certificate hundreds of loops start with the same plants and controllers, which settle first.
+_kept_state = lru_cache(maxsize=64)(_initial_state)
+
+
 class BlockPart:
     """A `Block` as a part; its state is stepped in place, without a copy for each sample."""
 
@@ -69,8 +78,9 @@ class BlockPart:
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:  # noqa: ARG002 - blocks know no absolute time
         """Return the outputs at the start; raise SettingsError for unknown parameters."""
-        state = self.block.initial_state(**parameters)
-        self._parameters, self._state = state.parameters, state.values.copy()
+        find = _kept_state if load_runtime(self.block.runtime).compiled else _initial_state
+        state = find(self.block, tuple(parameters.items()))
+        self._parameters, self._state = state.parameters.copy(), state.values.copy()
         self._outputs = state.outputs.copy()
         return self._outputs.copy()
 

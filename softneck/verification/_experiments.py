@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import product
 from typing import Any, ClassVar
 
@@ -339,6 +340,7 @@ class _Kicked:
         ), led * self.together
 
 
+@lru_cache(maxsize=16)
 def scale_loop_gain(
     controller: Block, observer: Block | None, outputs: tuple[str, ...] = _NECK.outputs.names, samples: int = 1
 ) -> tuple[Block, dict[str, str], dict[str, float]]:

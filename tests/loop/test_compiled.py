@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import control
@@ -29,7 +31,8 @@ from softneck.loop import (
 )
 from softneck.loop._faults import FAULT_KINDS, make_fault
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.runtime import Block, _compile, _numba_inner
+from softneck.runtime import Block, State, _compile, _numba_inner
+from softneck.runtime._own import OwnStep, own_runtime
 
 _KEYS: dict[str, dict[str, Any]] = {
     "sensor_bias": {"size_deg": 2.0}, "sensor_outlier": {"size_deg": 5.0, "share": 0.2, "seed": 3},
@@ -97,6 +100,39 @@ def test_parts_of_other_rates_and_a_reference_that_is_a_part(loop: Callable[...,
         loop(plant=neck, reference=wanted, order="jacobi"),
     ):
         _same(run_loop(case), run_loop(case, compiled=True))
+
+
+def test_a_block_settles_once_for_all_parts_with_the_same_parameters(
+    parts: dict[str, Block], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[Block, dict[str, float]]] = []
+    usual = Block.initial_state
+
+    def counted(block: Block, **parameters: float) -> State:
+        asked.append((block, parameters))
+        return usual(block, **parameters)
+
+    monkeypatch.setattr(Block, "initial_state", counted)
+    block, stiffness = replace(parts["plant"]), {"bending_stiffness": 0.9}
+
+    def started(parameters: dict[str, float]) -> list[bytes]:
+        part = BlockPart(block)
+        part.start(0.0, parameters)
+        found = [values.tobytes() for values in part.memory]
+        for values in part.memory:  # nobody else sees what becomes of them
+            values[:] = 7.0
+        return found
+
+    first = started(stiffness)
+    assert started(stiffness) == first != started({})
+    assert asked == [(block, stiffness), (block, {})]
+    # An object in Python may start otherwise each time.
+    own = OwnStep(SimpleNamespace(initial_state=lambda: [float(len(asked))], step=lambda state, _: (state, [])), ())
+    plain = Block(
+        kind="own", role="filter", runtime=own_runtime(own), sample_time=1.0, arrays=(), inputs=(), outputs=()
+    )
+    part = BlockPart(plain)
+    assert [part.start(0.0, {}).size + part.memory[1][0] for _ in range(2)] == [3.0, 4.0]
 
 
 def test_progress_is_reported(loop: Callable[..., Loop]) -> None:
