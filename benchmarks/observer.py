@@ -3,10 +3,9 @@
 `python benchmarks/observer.py [--seeds N] [--necks NECK...] [--grid | --unseen | --oracle | --causes]`
 
 Noise of 0.25 deg, 20 % of the samples lost, 2 % outliers, a blackout of a second in each of four motions; every filter
-sees the same. The model is an `oe` of 140 s of Eq. 22 with that noise. `no delay`, `default` (over 50 ms) and `data`
-are ours, the last with what `--data` makes of the recording that the model is from; `greybox` is the default over
-that model of the same recording, `fitted` with `--data`; `peer` is thirty lines of filterpy over the `oe` with three
-samples of look-ahead. Nothing is chosen here: the two necks that are held out have lines
+sees the same. The model is an `oe` of 140 s of Eq. 22 with that noise. `no delay` and `default` (over 50 ms) are ours;
+`greybox` is the default over that model of the same recording; `peer` is thirty lines of filterpy over the `oe` with
+three samples of look-ahead. Nothing is chosen here: the two necks that are held out have lines
 of their own; defaults are chosen by `leave_one_neck_out.py observer.*`.
 
 `--grid`: of the defaults over `oe` and over `greybox` the rms error, the same told the sensor's noise, that of the best
@@ -118,14 +117,10 @@ def row(neck: str, seed: int) -> dict[str, tuple[float, float]]:
     """Return rms errors [deg], over all and in the blackouts, of each filter."""
     _, log, runs = known(neck, seed)
     model = OutputError().fit(log)
-    observer = design_observer(KalmanSettings(), model, None)
-    over = KalmanSettings().design(GreyBox().fit(log))
     found = {
         "no delay": KalmanSettings(sensor_delay=0.0).design(model),
-        "default": observer,
-        "greybox": over,
-        "data": fit_levels_and_delays(observer, [log]).observer,
-        "fitted": fit_levels_and_delays(over, [log]).observer,
+        "default": design_observer(KalmanSettings(), model, None),
+        "greybox": KalmanSettings().design(GreyBox().fit(log)),
     }
     scores = {name: error(item, runs) for name, item in found.items()}
     return {**scores, "peer": errors_deg(runs, [peer(model, run.recording) for run in runs])}
@@ -222,7 +217,7 @@ def main() -> None:
             for neck, seed in product(wanted.necks, range(1, wanted.seeds + 1)):
                 print(line(neck, seed), flush=True)
             return
-    heads = ("no delay", "default", "data", "greybox", "fitted", "peer")
+    heads = ("no delay", "default", "greybox", "peer")
     print("rms error (in blackouts) [deg]\n" + f"{'':20}" + "".join(f"{head:>16}" for head in heads))
     for neck in wanted.necks:
         rows = [row(neck, seed) for seed in range(1, wanted.seeds + 1)]
