@@ -401,9 +401,13 @@ def _reference_table(loop: Loop, step: float, rows: int) -> Matrix | None:
     if hasattr(loop.reference, "advance"):
         return None
     function: Callable[[float], tuple[float, ...]] = loop.reference  # pyright: ignore[reportAssignmentType]
-    table = np.ones((rows, len(reference_ports(loop.robot))))
-    # Of a search and its certificate most loops have the same few references.
-    table[:, :-1] = (_kept_samples if getattr(function, "repeats", False) else _samples)(function, step, rows)
+    sample = _kept_samples if getattr(function, "repeats", False) else _samples
+    return sample(function, step, rows, len(reference_ports(loop.robot)))
+
+
+def _samples(function: Callable[[float], tuple[float, ...]], step: float, rows: int, columns: int) -> Matrix:
+    table = np.ones((rows, columns))
+    table[:, :-1] = [function(k * step) for k in range(rows)]
     bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
     if bad.size:
         k = int(bad[0])
@@ -411,13 +415,8 @@ def _reference_table(loop: Loop, step: float, rows: int) -> Matrix | None:
     return table
 
 
-def _samples(function: Callable[[float], tuple[float, ...]], step: float, rows: int) -> list[tuple[float, ...]]:
-    return [function(k * step) for k in range(rows)]
-
-
-@lru_cache(maxsize=64)
-def _kept_samples(function: Callable[[float], tuple[float, ...]], step: float, rows: int) -> Matrix:
-    return np.array(_samples(function, step, rows))
+# Of a search and its certificate most loops have the same few references.
+_kept_samples = lru_cache(maxsize=64)(_samples)
 
 
 def _columns(wiring: Wiring) -> dict[str, int]:
