@@ -19,12 +19,12 @@ import pandas as pd
 import pytest
 
 from softneck.core import DataError, FileFormatError, OutputFileError, SettingsError, metric_of
-from softneck.cosim import group_runs, held_runs, make_study, pareto_front, rank, read_runs, worst_runs
+from softneck.cosim import LoopSetup, group_runs, held_runs, make_study, pareto_front, rank, read_runs, worst_runs
 from softneck.cosim.loops._loop_table import OBJECT
 from softneck.cosim.studies import _run_study, _store, _study
 from softneck.cosim.studies._store import Store, _spread, column_types, pareto_rows, read_tables, write_worst
 from softneck.cosim.studies._study import Vary
-from softneck.loop import metric_names
+from softneck.loop import Loop, metric_names
 from softneck.plots import distribution_chart
 from softneck.report._study_page import kept_runs
 from softneck.robot import Robot
@@ -551,6 +551,15 @@ def test_a_scheduler_is_asked_for_ten_seconds_and_is_nobody_elses_default(monkey
         there.Client.side_effect = error("no")
         with pytest.raises(SettingsError, match=f"no Dask scheduler answers at tcp://there .{error.__name__}"):
             _run_study._client("tcp://there")
+
+
+@pytest.mark.parametrize("kind", [Loop, LoopSetup])
+def test_a_loop_itself_is_studied_as_its_table_from_where_the_study_is_made(
+    kind: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = Mock(spec=kind)
+    monkeypatch.setattr(_study, "loop_table", lambda given: {"of": given})
+    assert _study._open_loop(loop) == ({"of": loop}, Path.cwd())
 
 
 @pytest.mark.parametrize("loop", [5, None, ["loop.toml"], object()])

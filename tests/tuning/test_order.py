@@ -620,6 +620,15 @@ def test_linear_curves_are_of_the_first_output_with_the_nominal_plant_last(monke
     assert found["reference"] == [15.0]
 
 
+@pytest.mark.parametrize(("own", "duration"), [({"p": 1}, 7.0), ({}, 4.0)])
+def test_curves_last_as_long_as_the_steps_that_they_are_of_and_are_denser_at_the_start(
+    own: dict[str, Any], duration: float
+) -> None:
+    times = curve_times(task_for({"sim": {"duration_s": 7.0}, "step": {"duration_s": 4.0}}, own=own))
+    assert (times[0], times[-1]) == (0.0, duration)
+    assert (np.diff(times, 2) > 0.0).all()
+
+
 @pytest.mark.parametrize("drawn", [(), ("f, draw 1",)])
 @pytest.mark.parametrize("measured", [[], [False], [True], [False, True], [True, False], [True, True]])
 def test_one_family_that_was_tested_against_its_recordings_is_enough(

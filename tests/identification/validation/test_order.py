@@ -35,6 +35,7 @@ from softneck.identification.validation._score_tables import (
     RANGES,
     Rows,
     _block_sums,
+    block_length,
     coverage_tables,
     divergence,
     fit_intervals,
@@ -469,6 +470,25 @@ def test_blocks_are_of_the_rows_that_are_judged_and_of_every_segment_that_has_so
     expected = [sum(part[(k + i) % len(part)] for i in range(3)) for part in rows for k in range(len(part))]
     np.testing.assert_allclose(found, expected)
     assert _block_sums(np.zeros((30, 2)), np.repeat([0, 1, 2], 10), 3).shape == (0, 2)
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_block_has_three_correlation_times_of_the_slowest_signal(order: tuple[int, int]) -> None:
+    """The autocorrelation of a wave of period T is `(1 - k/n) cos(2 pi k/T)` at lag k, but for its end."""
+    rows, segment = 4000, np.zeros(4000, dtype=int)
+    lags, waves = np.arange(rows), [np.sin(2.0 * np.pi * np.arange(rows) / period) for period in (25.0, 125.0)]
+    quick, slow = (int(np.argmax((1.0 - lags / rows) * np.cos(2.0 * np.pi * lags / period) < 1.0 / np.e))
+                   for period in (25.0, 125.0))  # fmt: skip
+    signals = np.column_stack(waves)[:, order]
+    # Of two signals the slower; its end moves the lag by one at most.
+    assert block_length(signals, segment, 1.0) == pytest.approx(3 * slow, abs=3)
+    assert block_length(signals[:, :1], segment, 1.0) == pytest.approx(3 * (quick, slow)[order[0]], abs=3)
+    # At least five time constants, and at most an eighth of the rows; where both cannot be there is none.
+    assert block_length(signals, segment, 60.0) == 300
+    assert block_length(signals[:400], segment[:400], 1.0) == 50
+    assert block_length(signals, segment, 100.0) == 500
+    assert block_length(signals, segment, 100.2) is None
+    assert block_length(np.full((80, 1), np.nan), np.zeros(80, dtype=int), 1.0) == 5
 
 
 def test_every_row_is_predicted_up_to_75000_steps_and_every_nth_beyond() -> None:
