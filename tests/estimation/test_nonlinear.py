@@ -141,6 +141,21 @@ def test_in_darkness_it_says_what_the_model_will_say(play: Model, run: Recording
     np.testing.assert_allclose(estimates.rates[: len(rates)][at_rest], rates[at_rest], rtol=0, atol=1e-10)
 
 
+def test_what_the_model_misses_stays_on_the_way_to_now(play: Model, run: Recording) -> None:
+    """Ahead by 2.5 samples: the disturbance, and the timing error times the motion of then."""
+    held, at = jumping(run.rows(0, 200)), np.arange(200) + 2.5
+    observer = walking(replace(PLAIN, sensor_delay=0.05), play)
+    outputs, states = run_filter(observer, held)
+    told, angles = states[:, observer._parts["told"]], free_run(play, ramped(held, 15.6))
+    motion = np.diff(angles, axis=0, prepend=angles[:1])
+    then, moved = (np.column_stack([np.interp(at, np.arange(200), y) for y in x.T]) for x in (angles, motion))
+    # The set-points of the next four samples are known where they are held.
+    known = np.arange(200) % 20 < 15
+    assert np.abs(told[known, 2:] * moved[known]).max() > math.radians(0.1)
+    expected = then + told[:, :2] + told[:, 2:] * moved
+    np.testing.assert_allclose(outputs[known, :2], expected[known], rtol=0, atol=1e-12)
+
+
 def test_a_jump_goes_on_as_a_ramp_on_the_way_to_now(play: Model, run: Recording) -> None:
     """A sensor later than the model's dead time: what the set-points of now do is in what is told."""
     dark = {axis: np.full(200, math.nan) for axis in ("pitch", "roll")}
