@@ -36,6 +36,7 @@ from softneck.drives.running._pilot import LoopPilot, SignalLog, SignalPilot, ra
 from softneck.drives.running._preflight import PreflightCheck, Report, foreign_master, set_points_of_others
 from softneck.drives.running._stop import require_reset, require_stopped
 from softneck.drives.running._timing import Ask
+from softneck.drives.running._virtual import VirtualRun
 from softneck.loop import Loop
 from softneck.robot import Robot
 from softneck.signals import NECK
@@ -1384,3 +1385,21 @@ def test_a_successful_end_is_taken_back_by_the_first_event_after_it() -> None:
     for event in (first, second):
         master.supervisor.revoke(event)
         assert (master.supervisor.phase, master.supervisor.fault) == (Phase.STOPPED, first)
+
+
+@pytest.mark.parametrize("ends", [0, 3, math.inf])
+def test_a_simulated_run_is_over_when_its_master_is_done_and_two_minutes_after_its_loop_at_the_latest(
+    ends: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Ends:
+        @property
+        def finished(self) -> bool:
+            return run.cycles >= ends
+
+    def step(self: VirtualRun) -> None:
+        self.cycles += 1
+
+    monkeypatch.setattr(VirtualRun, "step", step)
+    run = VirtualRun(SimpleNamespace(cycle=0.5), Ends())  # pyright: ignore[reportArgumentType]
+    run.run(10.0)
+    assert run.cycles == min(ends, (10.0 + 120.0) / 0.5)
