@@ -1,4 +1,4 @@
-"""The first figure of a model: the fit to be expected on other motions, and the worst on what a training did not see."""
+"""The first figure of a model: the fit to be expected on other motions, and the worst on what training did not see."""
 
 from __future__ import annotations
 
