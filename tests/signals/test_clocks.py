@@ -18,7 +18,7 @@ from softneck.signals.importing._guess_units import judge
 from softneck.signals.importing._layout import Source, Term
 from softneck.signals.importing.formats._mat import mat_arrays
 from softneck.signals.importing.formats._text import is_date, seconds
-from softneck.signals.recording._resampling import Samples, find_gaps
+from softneck.signals.recording._resampling import Samples, find_gaps, jitter
 
 from ..data import neck_recording
 from .log_writers import from_angles
@@ -191,3 +191,22 @@ def test_a_pause_of_more_than_four_usual_steps_is_a_gap_on_a_clock_of_steps_of_a
     steps[5:165:10] = 1.1 ** np.arange(1, 17)
     found = find_gaps(Samples(np.cumsum(steps), np.zeros(400, dtype=np.int64), {}))[0]
     np.testing.assert_array_equal(found, steps[1:] >= 4.0)
+
+
+@pytest.mark.parametrize("start", [0.0, 3.0])
+def test_a_clock_jitters_where_long_steps_of_all_lengths_stand_and_not_where_it_is_even_or_has_gaps(
+    start: float,
+) -> None:
+    """What it tells are its shortest, longest and usual step; a stamp that stands twice and a new run are no steps."""
+    even = start + 0.02 * np.arange(300)
+    assert jitter(even) is None
+    assert jitter(np.where(np.arange(300) < 150, even, even + 5.0)) is None  # one gap
+    steps = np.full(400, 0.02)
+    steps[5:135:10] *= 1.1 ** np.arange(1, 14)  # none of four usual steps or more, which would be a pause
+    found = jitter(start + np.cumsum(steps))
+    assert found == pytest.approx((0.02, 0.02 * 1.1**13, 0.02))
+    twice = np.repeat(start + np.cumsum(steps), 2)
+    assert jitter(twice) == pytest.approx(found)
+    again = np.concatenate([start + np.cumsum(steps), start + np.cumsum(steps)])
+    assert jitter(again) == pytest.approx(found)
+    assert jitter(np.array([start, start - 1.0])) is None
