@@ -17,8 +17,8 @@ def numba_cache_name(package: str) -> str:
     """Return the folder name for code that `package` ("softneck" or "fmu") compiles in this environment.
 
     numba's entries are keyed by Python's version and by types, and the name of the source file contains its hash.
-    Neither contains the compiling environment: an entry may need softneck's own modules to load, another numba or NumPy,
-    or the way of compiling of another version of softneck.
+    Neither contains the compiling environment: an entry may need softneck's own modules to load, another numba or
+    NumPy, or the way of compiling of another version of softneck.
     """
     versions = [f"way{_WAY}", f"py{sys.version_info[0]}.{sys.version_info[1]}"]
     for name in ("numba", "numpy"):
