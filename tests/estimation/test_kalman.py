@@ -273,3 +273,22 @@ def test_an_innovation_that_is_no_number_passes_no_gate(outputs: int) -> None:
         assert found[1] is accepted
         # What is refused leaves no trace.
         assert (x.x.any(), (np.eye(n) == P).all()) == (accepted, not accepted)
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+def test_the_scatter_of_a_sensor_is_the_mean_square_of_its_changes_and_a_quiet_one_is_not_frozen(outputs: int) -> None:
+    rng, c = np.random.default_rng(0), np.zeros(40)
+    c[_parts.KALMAN_DIVIDER], c[_parts.KALMAN_FROZEN] = 1.0, 5.0
+    x: Any = SimpleNamespace(age=0.0, repeats=-1.0, scatter=0.0, measured=np.zeros(outputs))
+    last: Any = None
+    scatter, noise = 0.0, 0.01
+    for y in np.cumsum(1e-3 * noise * rng.standard_normal((200, outputs)), axis=0):
+        assert _parts.kalman_usable(c, x, y, 1.0, noise)
+        change = 0.0 if last is None else float(np.mean((y - last) ** 2))
+        scatter = scatter if last is None else _parts.KALMAN_KEEP * scatter + (1.0 - _parts.KALMAN_KEEP) * change
+        last = y
+        assert x.scatter == pytest.approx(scatter, rel=1e-12)
+    # One as quiet as no sensor of this noise repeats its values without being broken; one that was noisy does not.
+    assert all(_parts.kalman_usable(c, x, last, 1.0, noise) for _ in range(20))
+    x.scatter, x.repeats = noise**2, 0.0
+    assert [_parts.kalman_usable(c, x, last, 1.0, noise) for _ in range(6)] == [True] * 3 + [False] * 3

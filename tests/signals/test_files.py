@@ -18,7 +18,7 @@ from softneck.robot import Robot
 from softneck.signals import SET_POINTS, Recording, concatenate, read_recording, write_recording
 from softneck.signals.recording import _files
 from softneck.signals.recording._channels import known_channels
-from softneck.signals.recording._files import open_recording, read_plain_csv, recording_names
+from softneck.signals.recording._files import TextForm, open_recording, read_plain_csv, read_table, recording_names
 
 from ..data import changed, csv_lines, neck_recording
 
@@ -354,3 +354,10 @@ def test_a_sensor_without_any_sample_is_named_with_what_to_do(name: str, tmp_pat
     # One sample is enough.
     silent.channels[name][29] = 0.1  # pyright: ignore[reportIndexIssue]
     write_recording(tmp_path / "a.csv", silent)
+
+
+def test_blanks_behind_delimiters_belong_to_no_title_and_no_word(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("time, pitch, mode\n0.0, 1.5, fast\n0.1, 2.5, slow\n", encoding="utf-8")
+    found = read_table(path, ".csv", TextForm())
+    assert found.to_dict("list") == {"time": [0.0, 0.1], "pitch": [1.5, 2.5], "mode": ["fast", "slow"]}
