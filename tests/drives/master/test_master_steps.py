@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import struct
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 from softneck.drives.master import Frame, Master, MasterSettings, Phase, Tilt
 from softneck.drives.master._cia402 import DriveState
 from softneck.drives.master._events import Event
+from softneck.drives.master._fieldbus import BUS_OFF
 from softneck.drives.master._supervisor import GOALS
 
 from ..bench import Bench, Script, T
@@ -185,3 +187,54 @@ def test_a_drive_that_does_not_enable_is_given_its_second_and_no_more() -> None:
     assert (fault.name, fault.node) == ("enable_timeout", 2)
     # The first drive takes a few cycles, the second its second.
     assert 1.0 < fault.time - begin < 1.15
+
+
+@pytest.mark.parametrize(
+    ("frame", "told"),
+    [(Frame(0x080), "second_master"), (BUS_OFF, "bus_off"), (Frame(0x701, b"\0"), "boot_up"),
+     (Frame(0x082, b"\x10\x23\x01\0\0\0\0\0"), "emergency"), (Frame(0x181, b"\0"), "")],
+)  # fmt: skip
+def test_before_the_start_another_master_a_lost_bus_or_zero_and_an_emergency_end_it_and_nothing_else_counts(
+    frame: Frame, told: str
+) -> None:
+    master = new_master()
+    master.step(0.0, [frame])
+    assert dict(master.counts) == ({told: 1} if told else {})
+    fault = master.supervisor.fault
+    assert (fault.name if fault else "", master.supervisor.phase) == (told, Phase.STOPPED if told else Phase.IDLE)
+
+
+@pytest.mark.parametrize("left", [0, 1, 2])
+@pytest.mark.parametrize("phase", [Phase.ENABLING, Phase.RUNNING, Phase.DISABLING])
+def test_a_drive_that_was_enabled_and_is_no_more_stops_the_others_while_they_are_enabled(
+    left: int, phase: Phase
+) -> None:
+    master = new_master()
+    master.supervisor.phase, master._enabling = phase, 1
+    for view in master.bus.drives:
+        view.state = DriveState.ENABLED
+    master.bus.drives[left].state = DriveState.READY
+    master._watch(0.0, False, False, [])
+    # In the phase of enabling the first drive alone was enabled; when they are switched off none must be.
+    tells = phase is Phase.RUNNING or (phase is Phase.ENABLING and left == 0)
+    assert master.counts["drive_left"] == tells
+    fault = master.supervisor.fault
+    assert (fault.name, fault.node) == ("drive_left", left + 1) if tells and fault else not tells
+
+
+@pytest.mark.parametrize("fresh", [True, False])
+@pytest.mark.parametrize("phase", [Phase.RAMP_IN, Phase.RUNNING])
+def test_watches_get_a_sample_once_and_a_reference_only_in_a_run(fresh: bool, phase: Phase) -> None:
+    master, asked = new_master(), {}
+    master.supervisor.phase, master.reference = phase, (0.1, 0.2)
+    master._gate.last = Tilt(0.3, 0.4)
+    for view in master.bus.drives:
+        view.state = DriveState.ENABLED
+    quiet = {name: lambda *_: None for name in ("signs", "motors")}
+    master._watches = SimpleNamespace(  # pyright: ignore[reportAttributeAccessIssue]
+        **quiet, plausible=lambda *_, **told: asked.update(told), tilt=lambda *told: asked.update(values=told[3])
+    )
+    master._watch(0.0, True, fresh, [])
+    last = master._gate.last if fresh else None
+    assert (asked["sample"], asked["values"]) == (last, last and last.values)
+    assert asked["reference"] == ((0.1, 0.2) if phase is Phase.RUNNING else ())
