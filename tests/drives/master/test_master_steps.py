@@ -238,3 +238,48 @@ def test_watches_get_a_sample_once_and_a_reference_only_in_a_run(fresh: bool, ph
     last = master._gate.last if fresh else None
     assert (asked["sample"], asked["values"]) == (last, last and last.values)
     assert asked["reference"] == ((0.1, 0.2) if phase is Phase.RUNNING else ())
+
+
+@pytest.mark.parametrize("phase", [Phase.DISABLING, Phase.STOPPING])
+@pytest.mark.parametrize("state", [DriveState.READY, DriveState.ENABLED, DriveState.FAULT, DriveState.UNKNOWN])
+@pytest.mark.parametrize("fresh", [True, False])
+@pytest.mark.parametrize("last", [0, 2])
+@pytest.mark.parametrize("late", [True, False])
+def test_a_run_is_done_when_every_drive_says_now_that_it_is_off_and_a_stop_when_none_has_power(
+    phase: Phase, state: DriveState, fresh: bool, last: int, late: bool
+) -> None:
+    master, events = new_master(), list[Event]()
+    master.supervisor.phase = phase
+    for view in master.bus.drives:
+        view.state, view.fresh, view.silent = DriveState.DISABLED, True, 0
+    view = master.bus.drives[last]
+    view.state, view.fresh, view.silent = state, fresh, 0 if fresh else 6
+    master._switch_off(1.01 if late else 1.0, events)  # voltage is off one second after a stop at the latest
+    if phase is Phase.STOPPING:
+        off = late or state is not DriveState.ENABLED or not fresh
+        assert (master.supervisor.phase, events) == (Phase.STOPPED if off else phase, [])
+        return
+    off = state is DriveState.READY and fresh
+    assert master.supervisor.phase is (Phase.DONE if off else phase)
+    assert [(event.name, event.node) for event in events] == [("not_off", last + 1)] * (late and not off)
+
+
+@pytest.mark.parametrize("heard", [True, False])
+@pytest.mark.parametrize("silent", [0, 1])
+@pytest.mark.parametrize("state", [DriveState.READY, DriveState.FAULT, DriveState.REACTION, DriveState.ENABLED])
+@pytest.mark.parametrize("drive", [0, 2])
+def test_after_a_stop_guarding_ends_while_one_drive_that_was_heard_may_have_power(
+    heard: bool, silent: int, state: DriveState, drive: int
+) -> None:
+    """A drive that is silent now may brake or not: its own guarding switches it off."""
+    master = new_master()
+    for view in master.bus.drives:
+        view.heard, view.silent, view.state = True, 0, DriveState.DISABLED
+    view = master.bus.drives[drive]
+    view.heard, view.silent, view.state = heard, silent, state
+    assert not master.starved
+    master.supervisor.phase = Phase.STOPPED
+    unsure = silent > 0 or state in (DriveState.REACTION, DriveState.ENABLED)
+    assert master.starved is (heard and unsure)
+    master.supervisor.phase = Phase.DONE
+    assert not master.starved
