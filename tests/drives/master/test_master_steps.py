@@ -192,7 +192,8 @@ def test_a_drive_that_does_not_enable_is_given_its_second_and_no_more() -> None:
 @pytest.mark.parametrize(
     ("frame", "told"),
     [(Frame(0x080), "second_master"), (BUS_OFF, "bus_off"), (Frame(0x701, b"\0"), "boot_up"),
-     (Frame(0x082, b"\x10\x23\x01\0\0\0\0\0"), "emergency"), (Frame(0x181, b"\0"), ""), (Frame(0, b"\x08", error=True), "")],
+     (Frame(0x082, b"\x10\x23\x01\0\0\0\0\0"), "emergency"), (Frame(0x181, b"\0"), ""),
+     (Frame(0, b"\x08", error=True), "")],
 )  # fmt: skip
 def test_before_the_start_another_master_a_lost_bus_or_zero_and_an_emergency_end_it_and_nothing_else_counts(
     frame: Frame, told: str
