@@ -39,14 +39,14 @@ def walk_cost(
     row; `timing`: its variance at the start, that of the timing error, and what a sample keeps of this.
     """
     m = missed.shape[1]
-    told, P, none = np.zeros(2 * m), np.zeros((2 * m, 2 * m)), np.zeros(m)
+    told, P, none = np.zeros(2 * m), np.zeros(4 * m * m), np.zeros(m)
     for i in range(m):
-        P[i, i] = timing[0]
-        P[m + i, m + i] = timing[1]
+        P[i * 2 * m + i] = timing[0]
+        P[(m + i) * 2 * m + m + i] = timing[1]
     total = 0.0
     for k in range(missed.shape[0]):
         told[m:] *= timing[2]
-        nonlinear_widen(P, m, walked[k], timing[1], timing[2])
+        nonlinear_widen(P, m, 2 * m, walked[k], timing[1], timing[2])
         if np.isfinite(missed[k]).all():
             innovation, log_det = nonlinear_update(P, told, motion[k], none, missed[k], noise)
             if k >= start:

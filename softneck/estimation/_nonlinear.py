@@ -23,11 +23,12 @@ from ._axis import directions_of, slowest_seconds
 from ._forms import NOISES, noise_units, require_levels
 from ._kalman import fields_from_header, file_header, gate_and_timing_lines, observer_ports
 from ._kalman_parts_runtime import KALMAN_LEAD, KALMAN_MORE_LAGS
-from ._nonlinear_parts_runtime import NonlinearArrays
-from ._nonlinear_runtime import NonlinearState
+from ._nonlinear_parts_runtime import NonlinearArrays, NonlinearState
 from ._offline import Estimates, check_recording, filter_recording, run_filter
 
 _NONLINEAR_RUNTIME = "softneck.estimation._nonlinear_runtime"
+# Over a model that takes the payload as a parameter.
+_PAYLOAD_RUNTIME = "softneck.estimation._payload_runtime"
 FORM = "nonlinear"
 # A model settles within 6 scaled seconds. The recent motion keeps 0.95 of its value in 0.02 scaled seconds: it halves
 # in 0.27, the duration of a step.
@@ -129,7 +130,7 @@ class NonlinearObserver(ReprMixin):
         return Block(
             kind=FORM,
             role="observer",
-            runtime=f"{_NONLINEAR_RUNTIME}({plant.runtime}:{len(plant.arrays)})",
+            runtime=f"{_PAYLOAD_RUNTIME if payload else _NONLINEAR_RUNTIME}({plant.runtime}:{len(plant.arrays)})",
             sample_time=self.sample_time,
             arrays=(*self._own_arrays(plant), *plant.arrays),
             inputs=inputs,

@@ -1,15 +1,15 @@
 """Of the observer over nonlinear models: simulation of the model, its correction, and the prediction to the present.
 
 An output is that of the model, plus a disturbance, plus its motion in a sample times a timing error, plus the slope
-over the payload times the payload's error. These states `told` have the covariance `P`.
+over the payload times the payload's error. These n states `told` have the covariance `P` (n * n,), row after row.
 """
 
 import math
 
 import numpy as np
 
-from softneck.estimation._kalman_parts_runtime import KALMAN_LEAD, KALMAN_PERIOD
-from softneck.runtime._layout import Arrays, array, value
+from softneck.estimation._kalman_parts_runtime import KALMAN_GATE, KALMAN_LEAD, KALMAN_PERIOD, KalmanCounters
+from softneck.runtime._layout import Arrays, array, cells, rest, value
 from softneck.runtime._members_runtime import member_initialise, member_step
 
 # Places in `setup`; the model has more outputs than the measured ones.
@@ -45,6 +45,21 @@ class NonlinearArrays(Arrays):
     motors = value("setup", NONLINEAR_MOTORS)
     outputs = value("setup", NONLINEAR_OUTPUTS)
     copies = value("setup", NONLINEAR_COPIES)
+
+
+class NonlinearState(KalmanCounters):
+    """Counters, the estimates and their covariance; the state of each copy of the model follows."""
+
+    fastest = cells("", "motion of the model in a sample, of late")
+    payload = cells("", "estimated [kg]")
+    angles = cells("outputs", "of the model at the filter's time")
+    motion = cells("outputs", "of these in the last sample")
+    slopes = cells("outputs", "of these over the payload [1/kg]")
+    told = cells("2 * outputs", "disturbance of each output, then its timing error [samples]")
+    P = cells("2 * outputs + 1, 2 * outputs + 1", "covariance of `told` and the payload")
+    held = cells("motors", "set-points that came last")
+    reached = cells("motors", "set-points that moved the model last: no faster than the drives take them")
+    models = rest("states of the copies")
 
 
 def nonlinear_settle(
@@ -83,13 +98,14 @@ def nonlinear_faster(p: NonlinearArrays, fastest: float, angles: np.ndarray, bef
     return motion
 
 
-def nonlinear_widen(P: np.ndarray, m: int, walked: float, timing: float, keep: float) -> None:
+def nonlinear_widen(P: np.ndarray, m: int, n: int, walked: float, timing: float, keep: float) -> None:
     """Add a sample's noise: `walked` is the disturbances' variance, `timing` that of a timing error that fades."""
     for i in range(m):
-        P[i, i] += walked
-        P[m + i] *= keep
-        P[:, m + i] *= keep
-        P[m + i, m + i] += (1.0 - keep * keep) * timing
+        P[i * n + i] += walked
+        for j in range(n):
+            P[(m + i) * n + j] *= keep
+            P[j * n + m + i] *= keep
+        P[(m + i) * n + m + i] += (1.0 - keep * keep) * timing
 
 
 def nonlinear_update(
@@ -109,7 +125,7 @@ def nonlinear_update(
             h[2 * m] = slopes[i]
         for j in range(n):
             for k in range(n):
-                Ph[j] += P[j, k] * h[k]
+                Ph[j] += P[j * n + k] * h[k]
         S, e = noise * noise, missed[i]
         for j in range(n):
             S += h[j] * Ph[j]
@@ -119,8 +135,25 @@ def nonlinear_update(
         for j in range(n):
             told[j] += Ph[j] / S * e
             for k in range(n):
-                P[j, k] -= Ph[j] * Ph[k] / S
+                P[j * n + k] -= Ph[j] * Ph[k] / S
     return innovation, log_det
+
+
+def nonlinear_correct(
+    p: NonlinearArrays, noise: float, x: NonlinearState, measured: np.ndarray, forced: bool
+) -> tuple[float, bool]:
+    """Correct the estimates unless the gate rejects the measurement; return the NIS and whether it was accepted."""
+    m = p.outputs
+    # The payload's state is its error: that of the copies is subtracted.
+    told, P = np.zeros(2 * m + 1), x.P.copy()
+    told[: 2 * m] = x.told
+    innovation, x.log_det = nonlinear_update(P, told, x.motion, x.slopes, measured - x.angles, noise)
+    if not (forced or innovation <= p.constants[KALMAN_GATE]):
+        return innovation, False
+    x.told[:] = told[: 2 * m]
+    x.P[:] = P
+    x.payload = min(max(x.payload + told[2 * m], p.load[PAYLOAD_LEAST]), p.load[PAYLOAD_MOST])
+    return innovation, True
 
 
 def nonlinear_tell(

@@ -12,9 +12,7 @@ error method, Ljung and Soderstrom 1983, sec. 3.3). It is kept within the payloa
 import numpy as np
 
 from softneck.estimation._kalman_parts_runtime import (
-    KALMAN_GATE,
     KALMAN_LAG,
-    KalmanCounters,
     kalman_clear,
     kalman_count,
     kalman_forced,
@@ -25,38 +23,17 @@ from softneck.estimation._nonlinear_parts_runtime import (
     NONLINEAR_START,
     NONLINEAR_TIMING,
     NONLINEAR_TIMING_KEEP,
-    PAYLOAD_LEAST,
-    PAYLOAD_MOST,
-    PAYLOAD_WALK,
     NonlinearArrays,
+    NonlinearState,
+    nonlinear_correct,
     nonlinear_faster,
     nonlinear_move,
     nonlinear_settle,
     nonlinear_slew,
     nonlinear_tell,
-    nonlinear_update,
     nonlinear_widen,
 )
-from softneck.runtime._layout import cells, rest
 from softneck.runtime._members_runtime import member_size
-
-# Difference of the payload between both copies [kg]: far above rounding, and small beside the curvature.
-PAYLOAD_STEP = 0.02
-
-
-class NonlinearState(KalmanCounters):
-    """Counters, the estimates and their covariance; the state of each copy of the model follows."""
-
-    fastest = cells("", "motion of the model in a sample, of late")
-    payload = cells("", "estimated [kg]")
-    angles = cells("outputs", "of the model at the filter's time")
-    motion = cells("outputs", "of these in the last sample")
-    slopes = cells("outputs", "of these over the payload [1/kg]")
-    told = cells("2 * outputs", "disturbance of each output, then its timing error [samples]")
-    P = cells("2 * outputs + 1, 2 * outputs + 1", "covariance of `told` and the payload")
-    held = cells("motors", "set-points that came last")
-    reached = cells("motors", "set-points that moved the model last: no faster than the drives take them")
-    models = rest("states of the copies")
 
 
 def state_size(p: NonlinearArrays) -> int:
@@ -69,9 +46,6 @@ def initialise(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, ou
     x[:] = 0.0
     kalman_clear(p.constants, x)
     outputs[:] = 0.0
-    x.payload = p.load[PAYLOAD_MOST]
-    if p.copies > 1:
-        outputs[2 * p.outputs + 2] = x.payload
 
 
 def step(
@@ -80,7 +54,7 @@ def step(
     """Simulate one sample, then correct if there is a measurement that passes the gate.
 
     inputs: motor_setpoint_1..3, pitch_measured, roll_measured, measurement_valid.
-    outputs: pitch, roll, pitch_rate, roll_rate, innovation, healthy, and of two copies payload.
+    outputs: pitch, roll, pitch_rate, roll_rate, innovation, healthy.
     parameters: standard deviations of measurement and disturbance at rest, ratio of the disturbance to the motion.
     """
     c, n, m = p.constants, p.motors, p.outputs
@@ -103,7 +77,7 @@ def step(
     # Copies: the filter's model stays at the time of the measurement.
     nonlinear_tell(
         p,
-        nonlinear_free(p, x.payload),
+        p.free,
         models[: member_size(p, 0)].copy(),
         x.angles.copy(),
         x.motion.copy(),
@@ -114,74 +88,33 @@ def step(
     )
     outputs[2 * m] = innovation
     outputs[2 * m + 1] = 1.0 if kalman_healthy(c, x, parameters[0]) else 0.0
-    if p.copies > 1:
-        outputs[2 * m + 2] = x.payload
     x.samples += 1.0
 
 
-def nonlinear_free(p: NonlinearArrays, payload: float) -> np.ndarray:
-    """Return the model's parameters in simulation; with two copies the payload is the last one."""
-    free = p.free.copy()
-    if p.copies > 1:
-        free[free.shape[0] - 1] = payload
-    return free
-
-
 def nonlinear_start(p: NonlinearArrays, x: NonlinearState, asked: np.ndarray) -> None:
-    """Start at the heaviest payload, with the range as standard deviation.
-
-    A controller keeps tendons taut for the estimate. Too light an estimate leaves them slack, and a slack neck does not
-    show its payload.
-    """
+    """Bring the model to rest; nothing is known of what it misses."""
     start, timing, models, size = p.setup[NONLINEAR_START], p.setup[NONLINEAR_TIMING], x.models, member_size(p, 0)
     m = p.outputs
     for i in range(m):
         x.P[i, i] = start * start
         x.P[m + i, m + i] = timing * timing
-    x.P[2 * m, 2 * m] = (p.load[PAYLOAD_MOST] - p.load[PAYLOAD_LEAST]) ** 2
     x.held[:] = asked
     x.reached[:] = asked
-    more = np.empty(m)
-    nonlinear_settle(p, nonlinear_free(p, x.payload), models[:size], asked, x.angles)
-    if p.copies > 1:
-        nonlinear_settle(p, nonlinear_free(p, x.payload + PAYLOAD_STEP), models[size:], asked, more)
+    nonlinear_settle(p, p.free, models[:size], asked, x.angles)
 
 
 def nonlinear_predict(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, asked: np.ndarray) -> None:
     """Simulate the copies for one sample, and increase the covariance."""
-    m, models, size, before, more = p.outputs, x.models, member_size(p, 0), x.angles.copy(), np.empty(p.outputs)
+    m, models, size, before = p.outputs, x.models, member_size(p, 0), x.angles.copy()
     if p.constants[KALMAN_LAG] > 0.5:
         nonlinear_slew(p, x.reached, x.held)
     else:
         nonlinear_slew(p, x.reached, asked)
     x.held[:] = asked
-    nonlinear_move(p, nonlinear_free(p, x.payload), models[:size], x.reached, x.angles)
-    if p.copies > 1:
-        nonlinear_move(p, nonlinear_free(p, x.payload + PAYLOAD_STEP), models[size:], x.reached, more)
+    nonlinear_move(p, p.free, models[:size], x.reached, x.angles)
     x.fastest = nonlinear_faster(p, x.fastest, x.angles, before)
     for i in range(m):
         x.motion[i] = x.angles[i] - before[i]
-        if p.copies > 1:
-            x.slopes[i] = (more[i] - x.angles[i]) / PAYLOAD_STEP
         x.told[m + i] *= p.setup[NONLINEAR_TIMING_KEEP]
     walked = parameters[1] * parameters[1] + (parameters[2] * x.fastest) ** 2
-    P = x.P.reshape((2 * m + 1, 2 * m + 1))
-    nonlinear_widen(P, m, walked, p.setup[NONLINEAR_TIMING] ** 2, p.setup[NONLINEAR_TIMING_KEEP])
-    x.P[2 * m, 2 * m] += p.load[PAYLOAD_WALK] ** 2
-
-
-def nonlinear_correct(
-    p: NonlinearArrays, noise: float, x: NonlinearState, measured: np.ndarray, forced: bool
-) -> tuple[float, bool]:
-    """Correct the estimates unless the gate rejects the measurement; return the NIS and whether it was accepted."""
-    m = p.outputs
-    # The payload's state is its error: that of the copies is subtracted.
-    told, P = np.zeros(2 * m + 1), x.P.copy().reshape((2 * m + 1, 2 * m + 1))
-    told[: 2 * m] = x.told
-    innovation, x.log_det = nonlinear_update(P, told, x.motion, x.slopes, measured - x.angles, noise)
-    if not (forced or innovation <= p.constants[KALMAN_GATE]):
-        return innovation, False
-    x.told[:] = told[: 2 * m]
-    x.P[:] = P.reshape((2 * m + 1) * (2 * m + 1))
-    x.payload = min(max(x.payload + told[2 * m], p.load[PAYLOAD_LEAST]), p.load[PAYLOAD_MOST])
-    return innovation, True
+    nonlinear_widen(x.P, m, 2 * m + 1, walked, p.setup[NONLINEAR_TIMING] ** 2, p.setup[NONLINEAR_TIMING_KEEP])

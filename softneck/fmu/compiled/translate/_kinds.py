@@ -24,6 +24,7 @@ _NECK_RUNTIMES = (
     "softneck.plant._neck_runtime",
     "softneck.estimation._kalman_runtime",
     "softneck.estimation._nonlinear_runtime",
+    "softneck.estimation._payload_runtime",
     "softneck.design.linear._linear_controller_runtime",
     "softneck.design.varying._adaptive_runtime",
     "softneck.design.predictive._mpc_runtime",
