@@ -137,7 +137,8 @@ def gather(
             name, draws, controller.block, asked, order=controller.order, observer=observer, attempt=attempt,
             progress=late,
         ))  # fmt: skip
-        if "sim.slack_s" not in evidence.metrics:
+        slack = any(bound.metric == "sim.slack_s" for bound in asked.bounds)  # of tendons alone
+        if slack and "sim.slack_s" not in evidence.metrics:
             evidence.not_computed["sim.slack_s"] = (
                 "draws have no tension outputs; verify over FAMILY and a NECK (`softneck.calibrate` in Python makes it)"
             )

@@ -504,9 +504,10 @@ def test_what_was_not_computed_is_said() -> None:
 
 @pytest.mark.parametrize("own", [True, False])
 @pytest.mark.parametrize("drawn", [True, False])
+@pytest.mark.parametrize("slack", [True, False])
 @pytest.mark.parametrize("sim", [{}, {"decides": True}, {"preset": "n.toml"}])
 def test_loops_decide_over_models_draws_and_what_is_asked_and_over_a_built_in_plant_for_nobody(
-    own: bool, drawn: bool, sim: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    own: bool, drawn: bool, slack: bool, sim: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = Evidence(None, None, [], None, None, [])  # pyright: ignore[reportArgumentType]
     ran: list[Any] = []
@@ -522,8 +523,9 @@ def test_loops_decide_over_models_draws_and_what_is_asked_and_over_a_built_in_pl
     monkeypatch.setattr(_evidence, "_add_drawn", lambda _, names: ran.append(names))
     under: Any = SimpleNamespace(robot=Robot.preset(), order="sequential", block=None)
     plants: Any = [SimpleNamespace(name="own", thing=1)] * own
-    found = _evidence.gather(under, [], make_requirements({"sim": sim}), observer=None, progress=lambda *_: None,
-                             families={}, own=plants, attempt=3)  # fmt: skip
+    asked = make_requirements({"sim": sim, "require": {"sim.slack_s": slack and 0.1}})
+    found = _evidence.gather(under, [], asked, observer=None, progress=lambda *_: None, families={}, own=plants,
+                             attempt=3)  # fmt: skip
     assert found.foreign is not (own or drawn or bool(sim))
     simulated = own or not drawn
     assert (found.necks, found.crossings) == ((["run"], ["crossing"]) if simulated else ([], []))
@@ -532,7 +534,8 @@ def test_loops_decide_over_models_draws_and_what_is_asked_and_over_a_built_in_pl
     assert [item["attempt"] for item in ran if "attempt" in item] == [3] * len(found.drawn)
     assert ran[-1] == ({"sim.rise_s"} if drawn else set())
     assert found.not_computed["payload 2 kg"] == "judged at 1 kg"
-    assert ("sim.slack_s" in found.not_computed) is drawn
+    # Slack is of tendons: where nobody asks for it, nothing is missing.
+    assert ("sim.slack_s" in found.not_computed) is (drawn and slack)
 
 
 def test_further_values_of_a_metric_are_appended_each_with_its_own_facts() -> None:
