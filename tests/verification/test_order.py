@@ -523,7 +523,7 @@ def test_loops_decide_over_models_draws_and_what_is_asked_and_over_a_built_in_pl
     monkeypatch.setattr(_evidence, "_add_drawn", lambda _, names: ran.append(names))
     under: Any = SimpleNamespace(robot=Robot.preset(), order="sequential", block=None)
     plants: Any = [SimpleNamespace(name="own", thing=1)] * own
-    asked = make_requirements({"sim": sim, "require": {"sim.slack_s": slack and 0.1}})
+    asked = make_requirements({"sim": sim, "require": {"sim.slack_s": {"max": 0.1} if slack else False}})
     found = _evidence.gather(under, [], asked, observer=None, progress=lambda *_: None, families={}, own=plants,
                              attempt=3)  # fmt: skip
     assert found.foreign is not (own or drawn or bool(sim))
