@@ -1,8 +1,8 @@
 """The part of every FMU that compiles its `step` with numba if the host has it (docs, how-to, FMUs).
 
-If softneck is installed too, it uses the same cache folder, module names and options as softneck itself
-(`runtime._compile`), so that each finds the code that the other has compiled. Otherwise FMUs have a folder of their
-own, as code that softneck compiled may need its modules. Standard library, numpy and numba only.
+FMUs have a cache folder and module names of their own. Code that softneck compiled may need its modules, and functions
+of one name that were compiled in two ways are not to meet in one process: one may call the other, with other arguments.
+Standard library, numpy and numba only.
 """
 
 import importlib.util
@@ -34,7 +34,7 @@ def _fmu_compiled_step(
     wanted = always or switch == "1"
     if switch == "0" or facts["cost"] == "own" or not (wanted or facts["cost"] != "light") or not _fmu_have("numba"):
         return None
-    alias = facts["runtime"] + "_compiled"
+    alias = facts["runtime"] + "_fmu"
     here = sys.modules.get(alias)
     try:
         if hasattr(getattr(here, "step", None), "py_func"):
@@ -69,14 +69,14 @@ def _fmu_have(package: str) -> bool:
 
 
 def _fmu_cache_folder() -> Path:
-    """Return softneck's folder of compiled runtimes (in the user's cache folder, as in platformdirs)."""
+    """Return the folder of FMUs' compiled runtimes (in softneck's folder of the user's cache, as in platformdirs)."""
     if sys.platform == "win32":
         cache = Path(os.environ.get("LOCALAPPDATA") or Path.home(), "softneck", "Cache")
     elif sys.platform == "darwin":
         cache = Path.home() / "Library" / "Caches" / "softneck"
     else:
         cache = Path(os.environ.get("XDG_CACHE_HOME", "").strip() or Path.home() / ".cache", "softneck")
-    return cache / "runtime" / numba_cache_name("softneck" if _fmu_have("softneck") else "fmu")
+    return cache / "runtime" / numba_cache_name("fmu")
 
 
 def _fmu_cached_text(facts: dict[str, Any], folder: str, cache: Path) -> Path:
