@@ -7,7 +7,7 @@ import numpy as np
 from softneck.estimation._kalman_parts_runtime import KalmanArrays
 from softneck.estimation._kalman_runtime import KalmanFullState, step
 from softneck.estimation._kalman_runtime import initialise as initialise
-from softneck.estimation._nonlinear_parts_runtime import nonlinear_update, nonlinear_widen
+from softneck.estimation._nonlinear_parts_runtime import nonlinear_grow, nonlinear_update
 
 
 def kalman_cost(
@@ -46,7 +46,7 @@ def walk_cost(
     total = 0.0
     for k in range(missed.shape[0]):
         told[m:] *= timing[2]
-        nonlinear_widen(P, m, 2 * m, walked[k], timing[1], timing[2])
+        nonlinear_grow(P, m, 2 * m, walked[k], timing[1], timing[2])
         if np.isfinite(missed[k]).all():
             innovation, log_det = nonlinear_update(P, told, motion[k], none, missed[k], noise)
             if k >= start:

@@ -150,16 +150,12 @@ class NonlinearObserver(ReprMixin):
         setup = np.array([
             motors, len(robot.outputs.names), len(plant.outputs),
             max(1, round(_SETTLING_S / scaled)), self.start, _MOTION_MEMORY ** (scaled / _NOMINAL_PERIOD_S),
-            1 if self.payloads is None else 2, self.timing / period, self._timing_kept,
+            self.timing / period, self._timing_kept,
             *(period * most for most in self.slew or (_NO_SLEW_LIMIT,) * motors),
         ])  # fmt: skip
         free = plant.initial_state(use_measurement=0.0).parameters
-        return (
-            setup,
-            self.constants,
-            free,
-            np.array([least, most, _PAYLOAD_WALK * (most - least) * math.sqrt(scaled)]),
-        )
+        load = np.array([least, most, _PAYLOAD_WALK * (most - least) * math.sqrt(scaled)])
+        return setup, self.constants, free, load
 
     def initial_state(self, **parameters: float) -> State:
         """Return the state at the start; parameters are the noise levels by name."""

@@ -19,10 +19,9 @@ NONLINEAR_TOLD = 2
 NONLINEAR_SETTLE = 3
 NONLINEAR_START = 4
 NONLINEAR_KEEP = 5
-NONLINEAR_COPIES = 6
-NONLINEAR_TIMING = 7
-NONLINEAR_TIMING_KEEP = 8
-NONLINEAR_SLEW = 9  # one a motor
+NONLINEAR_TIMING = 6
+NONLINEAR_TIMING_KEEP = 7
+NONLINEAR_SLEW = 8  # one a motor
 # Places in `load`.
 PAYLOAD_LEAST = 0
 PAYLOAD_MOST = 1
@@ -35,16 +34,14 @@ class NonlinearArrays(Arrays):
     setup = array(
         "places",
         "motors, outputs, outputs of the model, samples until it stands, standard deviation of the disturbance at "
-        "the start, part of the fastest motion that a sample keeps, copies of the model, standard deviation of its "
-        "timing error [samples], part of that which a sample keeps, then of each motor the most that its set-point "
-        "moves the model in a sample",
+        "the start, part of the fastest motion that a sample keeps, standard deviation of the timing error [samples], "
+        "part of that which a sample keeps, then of each motor the most that its set-point moves the model in a sample",
     )
     constants = array("numbers", "see KALMAN_*; a lag of 1: the set-points come a sample early")
     free = array("parameters", "of the model in free run")
-    load = array("3", "least and most payload [kg], standard deviation of its walk in a sample [kg]; 0 for one copy")
+    load = array("3", "least and most payload [kg], standard deviation of its walk in a sample [kg]; 0 without one")
     motors = value("setup", NONLINEAR_MOTORS)
     outputs = value("setup", NONLINEAR_OUTPUTS)
-    copies = value("setup", NONLINEAR_COPIES)
 
 
 class NonlinearState(KalmanCounters):
@@ -98,7 +95,18 @@ def nonlinear_faster(p: NonlinearArrays, fastest: float, angles: np.ndarray, bef
     return motion
 
 
-def nonlinear_widen(P: np.ndarray, m: int, n: int, walked: float, timing: float, keep: float) -> None:
+def nonlinear_widen(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, before: np.ndarray) -> None:
+    """Note the motion of a sample, and increase the covariance by its noise; `before`: angles before it."""
+    m = p.outputs
+    x.fastest = nonlinear_faster(p, x.fastest, x.angles, before)
+    for i in range(m):
+        x.motion[i] = x.angles[i] - before[i]
+        x.told[m + i] *= p.setup[NONLINEAR_TIMING_KEEP]
+    walked = parameters[1] * parameters[1] + (parameters[2] * x.fastest) ** 2
+    nonlinear_grow(x.P, m, 2 * m + 1, walked, p.setup[NONLINEAR_TIMING] ** 2, p.setup[NONLINEAR_TIMING_KEEP])
+
+
+def nonlinear_grow(P: np.ndarray, m: int, n: int, walked: float, timing: float, keep: float) -> None:
     """Add a sample's noise: `walked` is the disturbances' variance, `timing` that of a timing error that fades."""
     for i in range(m):
         P[i * n + i] += walked

@@ -1,12 +1,8 @@
-"""Simulation of a nonlinear model, and what it misses: a disturbance of its outputs, a timing error, the payload.
+"""Simulation of a nonlinear model, and what it misses: a disturbance of its outputs and a timing error.
 
 Member 0 is the model. Its state is not corrected, so it stays reachable, and the model needs no derivatives. The
 disturbance is a random walk whose step grows with the motion. Delays and time constants that the model has wrong, or
 that change with the motion, make it early or late: this shifts an output by its rate times the timing error.
-
-A model with a payload parameter is simulated in two copies, with the estimated payload and with a little more. Their
-difference is the derivative of the outputs, and the payload is a further random-walk state (a recursive prediction
-error method, Ljung and Soderstrom 1983, sec. 3.3). It is kept within the payloads of the recordings.
 """
 
 import numpy as np
@@ -22,11 +18,9 @@ from softneck.estimation._kalman_parts_runtime import (
 from softneck.estimation._nonlinear_parts_runtime import (
     NONLINEAR_START,
     NONLINEAR_TIMING,
-    NONLINEAR_TIMING_KEEP,
     NonlinearArrays,
     NonlinearState,
     nonlinear_correct,
-    nonlinear_faster,
     nonlinear_move,
     nonlinear_settle,
     nonlinear_slew,
@@ -38,7 +32,7 @@ from softneck.runtime._members_runtime import member_size
 
 def state_size(p: NonlinearArrays) -> int:
     """Return the length of the state vector."""
-    return NonlinearState.size(p) + p.copies * member_size(p, 0)
+    return NonlinearState.size(p) + member_size(p, 0)
 
 
 def initialise(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, outputs: np.ndarray) -> None:
@@ -104,17 +98,12 @@ def nonlinear_start(p: NonlinearArrays, x: NonlinearState, asked: np.ndarray) ->
 
 
 def nonlinear_predict(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, asked: np.ndarray) -> None:
-    """Simulate the copies for one sample, and increase the covariance."""
-    m, models, size, before = p.outputs, x.models, member_size(p, 0), x.angles.copy()
+    """Simulate the model for one sample, and increase the covariance."""
+    models, size, before = x.models, member_size(p, 0), x.angles.copy()
     if p.constants[KALMAN_LAG] > 0.5:
         nonlinear_slew(p, x.reached, x.held)
     else:
         nonlinear_slew(p, x.reached, asked)
     x.held[:] = asked
     nonlinear_move(p, p.free, models[:size], x.reached, x.angles)
-    x.fastest = nonlinear_faster(p, x.fastest, x.angles, before)
-    for i in range(m):
-        x.motion[i] = x.angles[i] - before[i]
-        x.told[m + i] *= p.setup[NONLINEAR_TIMING_KEEP]
-    walked = parameters[1] * parameters[1] + (parameters[2] * x.fastest) ** 2
-    nonlinear_widen(x.P, m, 2 * m + 1, walked, p.setup[NONLINEAR_TIMING] ** 2, p.setup[NONLINEAR_TIMING_KEEP])
+    nonlinear_widen(p, parameters, x, before)

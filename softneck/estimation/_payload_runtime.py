@@ -1,4 +1,9 @@
-"""The observer over a model with a payload parameter: two copies of it, and the payload as a further state."""
+"""The observer over a model with a payload parameter: it estimates the payload too.
+
+Two copies of the model are simulated, one with the estimated payload and one with a little more. Their difference is
+the derivative of the outputs, and the payload is a further random-walk state (a recursive prediction error method,
+Ljung and Soderstrom 1983, sec. 3.3). It is kept within the payloads of the recordings.
+"""
 
 import numpy as np
 
@@ -13,14 +18,12 @@ from softneck.estimation._kalman_parts_runtime import (
 from softneck.estimation._nonlinear_parts_runtime import (
     NONLINEAR_START,
     NONLINEAR_TIMING,
-    NONLINEAR_TIMING_KEEP,
     PAYLOAD_LEAST,
     PAYLOAD_MOST,
     PAYLOAD_WALK,
     NonlinearArrays,
     NonlinearState,
     nonlinear_correct,
-    nonlinear_faster,
     nonlinear_move,
     nonlinear_settle,
     nonlinear_slew,
@@ -35,7 +38,7 @@ PAYLOAD_STEP = 0.02
 
 def state_size(p: NonlinearArrays) -> int:
     """Return the length of the state vector."""
-    return NonlinearState.size(p) + p.copies * member_size(p, 0)
+    return NonlinearState.size(p) + 2 * member_size(p, 0)
 
 
 def initialise(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, outputs: np.ndarray) -> None:
@@ -44,8 +47,7 @@ def initialise(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, ou
     kalman_clear(p.constants, x)
     outputs[:] = 0.0
     x.payload = p.load[PAYLOAD_MOST]
-    if p.copies > 1:
-        outputs[2 * p.outputs + 2] = x.payload
+    outputs[2 * p.outputs + 2] = x.payload
 
 
 def step(
@@ -54,7 +56,7 @@ def step(
     """Simulate one sample, then correct if there is a measurement that passes the gate.
 
     inputs: motor_setpoint_1..3, pitch_measured, roll_measured, measurement_valid.
-    outputs: pitch, roll, pitch_rate, roll_rate, innovation, healthy, and of two copies payload.
+    outputs: pitch, roll, pitch_rate, roll_rate, innovation, healthy, payload.
     parameters: standard deviations of measurement and disturbance at rest, ratio of the disturbance to the motion.
     """
     c, n, m = p.constants, p.motors, p.outputs
@@ -88,17 +90,14 @@ def step(
     )
     outputs[2 * m] = innovation
     outputs[2 * m + 1] = 1.0 if kalman_healthy(c, x, parameters[0]) else 0.0
-    if p.copies > 1:
-        outputs[2 * m + 2] = x.payload
+    outputs[2 * m + 2] = x.payload
     x.samples += 1.0
 
 
 def payload_free(p: NonlinearArrays, payload: float) -> np.ndarray:
-    """Return the model's parameters in simulation; with two copies the payload is the last one."""
-    free = np.empty(p.free.shape[0])
-    free[:] = p.free
-    if p.copies > 1:
-        free[free.shape[0] - 1] = payload
+    """Return the model's parameters in simulation, of which the payload is the last."""
+    free = p.free.copy()
+    free[free.shape[0] - 1] = payload
     return free
 
 
@@ -118,27 +117,20 @@ def payload_start(p: NonlinearArrays, x: NonlinearState, asked: np.ndarray) -> N
     x.reached[:] = asked
     more = np.empty(m)
     nonlinear_settle(p, payload_free(p, x.payload), models[:size], asked, x.angles)
-    if p.copies > 1:
-        nonlinear_settle(p, payload_free(p, x.payload + PAYLOAD_STEP), models[size:], asked, more)
+    nonlinear_settle(p, payload_free(p, x.payload + PAYLOAD_STEP), models[size:], asked, more)
 
 
 def payload_predict(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, asked: np.ndarray) -> None:
-    """Simulate the copies for one sample, and increase the covariance."""
-    m, models, size, before, more = p.outputs, x.models, member_size(p, 0), x.angles.copy(), np.empty(p.outputs)
+    """Simulate both copies for one sample, and increase the covariance."""
+    models, size, before, more = x.models, member_size(p, 0), x.angles.copy(), np.empty(p.outputs)
     if p.constants[KALMAN_LAG] > 0.5:
         nonlinear_slew(p, x.reached, x.held)
     else:
         nonlinear_slew(p, x.reached, asked)
     x.held[:] = asked
     nonlinear_move(p, payload_free(p, x.payload), models[:size], x.reached, x.angles)
-    if p.copies > 1:
-        nonlinear_move(p, payload_free(p, x.payload + PAYLOAD_STEP), models[size:], x.reached, more)
-    x.fastest = nonlinear_faster(p, x.fastest, x.angles, before)
-    for i in range(m):
-        x.motion[i] = x.angles[i] - before[i]
-        if p.copies > 1:
-            x.slopes[i] = (more[i] - x.angles[i]) / PAYLOAD_STEP
-        x.told[m + i] *= p.setup[NONLINEAR_TIMING_KEEP]
-    walked = parameters[1] * parameters[1] + (parameters[2] * x.fastest) ** 2
-    nonlinear_widen(x.P, m, 2 * m + 1, walked, p.setup[NONLINEAR_TIMING] ** 2, p.setup[NONLINEAR_TIMING_KEEP])
-    x.P[2 * m, 2 * m] += p.load[PAYLOAD_WALK] ** 2
+    nonlinear_move(p, payload_free(p, x.payload + PAYLOAD_STEP), models[size:], x.reached, more)
+    for i in range(p.outputs):
+        x.slopes[i] = (more[i] - x.angles[i]) / PAYLOAD_STEP
+    nonlinear_widen(p, parameters, x, before)
+    x.P[2 * p.outputs, 2 * p.outputs] += p.load[PAYLOAD_WALK] ** 2
