@@ -136,8 +136,8 @@ def way_on(binding: str | None, *, unheard: bool, blind: bool = False, unknown: 
         return "No setting of a controller fixes it: give what is missing, or leave the requirement out"
     if doubt:
         return (
-            f"The family's draws decide little, as {doubt}: record more, longer and to other heights, and give the "
-            "family all recordings"
+            f"The family's draws decide little, as {doubt}: record longer, with steps to other heights, and make the "
+            "family of all recordings"
         )
     if binding is None:
         return "Continue with a larger --budget"

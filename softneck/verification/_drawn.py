@@ -95,7 +95,7 @@ class Drawn:
     def statement(self) -> str:
         """Return what the loops over the draws say."""
         if self.failed:
-            doubt = f", but {self.draws.doubt}" if self.draws.doubt else ""
+            doubt = f"; {self.draws.doubt}, so they decide little" if self.draws.doubt else ""
             return f"{len(self.failed)} of {self.count} draws of {self.family} fail{doubt}"
         tries = "" if self.attempt == 1 else f" (attempt {self.attempt}, which is counted)"
         return (
@@ -430,19 +430,18 @@ def _unreached(draws: Draws, asked: Requirements) -> dict[str, str]:
     """Return "sim" -> why the recordings do not reach the steps, and what to record."""
     size, most = asked.scale.si(float(asked.sim["size_deg"])), min(draws.conditions["motion"])
     shown, unit = asked.scale.shown, error_unit(asked.robot)[0]
+    ours = asked.robot.tendon_angles is not None  # of which `softneck record` has experiments
     found = []
     if size > _BEYOND * most:
+        command = " (`softneck record eq22`, or `multisine` with a larger --amplitude)" if ours else ""
         found.append(
-            f"steps of {shown(size):.3g} {unit}, the recordings move {shown(most):.3g} "
-            f"{unit}; record larger motions (`softneck record eq22`, or `multisine` with a larger --amplitude), or set "
-            f"`[sim] {asked.scale.name_of('size_deg')}`"
+            f"steps of {shown(size):.3g} {unit}, the recordings move {shown(most):.3g} {unit}; record larger "
+            f"motions{command}, or set `[sim] {asked.scale.name_of('size_deg')}`"
         )
-    heavy = max(draws.conditions["payload_kg"])
-    if asked.own.get("sim", {}).get("payloads_kg") and max(asked.sim["payloads_kg"]) > heavy + 1e-9:
-        found.append(
-            f"a payload of {max(asked.sim['payloads_kg']):g} kg, recorded up to {heavy:g} "
-            f"kg; record with it (`softneck record eq22 --payload {max(asked.sim['payloads_kg']):g}`)"
-        )
+    heavy, heaviest = max(draws.conditions["payload_kg"]), max(asked.sim["payloads_kg"])
+    if asked.own.get("sim", {}).get("payloads_kg") and heaviest > heavy + 1e-9:
+        command = f" (`softneck record eq22 --payload {heaviest:g}`)" if ours else ""
+        found.append(f"a payload of {heaviest:g} kg, recorded up to {heavy:g} kg; record with it{command}")
     return {"sim": f"not supported by the data: {'; '.join(found)}"} if found else {}
 
 

@@ -156,7 +156,7 @@ def test_no_certificate_where_the_loops_of_tuning_alone_do_not_hold(
 def test_draws_that_decide_little_ask_for_a_recording(binding: str | None) -> None:
     way = way_on(binding, unheard=False, doubt="they cover 79 % of middle motions, not 95 %")
     assert "79 % of middle motions" in way
-    assert "record more" in way
+    assert "record longer" in way
     assert "oosen" not in way
     assert "budget" not in way
 

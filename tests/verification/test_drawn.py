@@ -16,6 +16,7 @@ from softneck.core import DataError, certificate_contents, write_certificate
 from softneck.identification import Draws, Family
 from softneck.identification.uncertainty import _draws
 from softneck.loop import LoopResult
+from softneck.robot import Robot
 from softneck.verification import Requirement, _drawn, make_requirements, verify
 from softneck.verification._drawn import Drawn, _Margin, certified_content, draws_of, run_drawn
 from softneck.verification._experiments import Experiment, LoopUnderTest, crossing_values, crossings
@@ -158,7 +159,7 @@ def test_draws_say_how_many_hold_at_which_attempt() -> None:
     bad = drawn((1, 4))
     assert (bad.content, bad.statement()) == (0.0, "2 of 59 draws of f fail")
     doubted = replace(bad, draws=SimpleNamespace(doubt="they differ"))  # pyright: ignore[reportArgumentType]
-    assert doubted.statement() == "2 of 59 draws of f fail, but they differ"
+    assert doubted.statement() == "2 of 59 draws of f fail; they differ, so they decide little"
     assert bad.facts() == {
         "family": "f", "count": 59, "failed": [1, 4], "attempt": 1, "content": 0.0, "confidence": 0.95, "seed": 7,
         "kind": "play", "coverage": [1], "level": 0.9, "statement": "2 of 59 draws of f fail",
@@ -226,6 +227,20 @@ def test_conditions_beyond_the_recordings_are_told(
     assert told in found.get("sim", "")
     # Of two conditions each is told.
     assert ("steps of 11 deg" in found.get("sim", "")) is (changes.get("size_deg") == 11.01)
+
+
+def test_a_command_for_a_recording_is_told_of_robots_with_tendons_alone() -> None:
+    """`softneck record` has a neck and its like; a valve in kPa it does not move."""
+    valve = Robot.from_dict({
+        "name": "valve", "motors": {"names": ["valve"], "unit": "kPa", "setpoint_min": 0.0, "setpoint_max": 100.0},
+        "outputs": {"names": ["tip"], "unit": "mm", "min": [-10.0], "max": [10.0]}, "directions": {"kind": "identified"},
+    })  # fmt: skip
+    for robot, known in ((Robot.preset(), True), (valve, False)):
+        draws = told_draws(motion=[1e-6], payload_kg=[0.0])
+        said = _drawn._unreached(draws, make_requirements({"sim": {"payloads_kg": [0.6]}}, robot=robot))["sim"]
+        assert "record larger motions" in said
+        assert "a payload of 0.6 kg" in said
+        assert ("softneck record" in said) is known
 
 
 def test_a_draw_carries_the_lightest_and_the_heaviest_payload() -> None:
