@@ -112,8 +112,8 @@ class KalmanSettings:
     this form if the model is nonlinear. Measurement noise is white.
 
     Noise and rate of the sensor are those of the robot's file, the noise at least that of the recordings of a nonlinear
-    model; other levels follow from the range and the speed of its
-    outputs. Levels are given in the unit of its outputs, angles in rad. All levels are parameters of the block.
+    model; other levels follow from the range and the speed of its outputs. Levels are given in the unit of its outputs,
+    angles in rad. All levels are parameters of the block.
 
     Attributes:
         form: "model", "gyro" or "nonlinear".

@@ -8,9 +8,9 @@ import sys
 from importlib import metadata
 from typing import Any
 
-# Number of the way in which runtimes are compiled: one more where code of before is not to be mixed with that of now.
-# Before 2, functions called inner ones by a name that code of another entry may have; a process could crash.
-_WAY = 2
+# Version of how runtimes are compiled: one more where code of before is not to be mixed with that of now. Before 2,
+# functions called inner ones by a name that code of another entry may have; a process could crash.
+_CACHE_VERSION = 2
 
 
 def numba_cache_name(package: str) -> str:
@@ -18,9 +18,9 @@ def numba_cache_name(package: str) -> str:
 
     numba's entries are keyed by Python's version and by types, and the name of the source file contains its hash.
     Neither contains the compiling environment: an entry may need softneck's own modules to load, another numba or
-    NumPy, or the way of compiling of another version of softneck.
+    NumPy, or code that another version of softneck compiled in another way.
     """
-    versions = [f"way{_WAY}", f"py{sys.version_info[0]}.{sys.version_info[1]}"]
+    versions = [f"v{_CACHE_VERSION}", f"py{sys.version_info[0]}.{sys.version_info[1]}"]
     for name in ("numba", "numpy"):
         try:
             versions.append(f"{name}{metadata.version(name)}")

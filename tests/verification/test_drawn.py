@@ -233,7 +233,8 @@ def test_a_command_for_a_recording_is_told_of_robots_with_tendons_alone() -> Non
     """`softneck record` has a neck and its like; a valve in kPa it does not move."""
     valve = Robot.from_dict({
         "name": "valve", "motors": {"names": ["valve"], "unit": "kPa", "setpoint_min": 0.0, "setpoint_max": 100.0},
-        "outputs": {"names": ["tip"], "unit": "mm", "min": [-10.0], "max": [10.0]}, "directions": {"kind": "identified"},
+        "outputs": {"names": ["tip"], "unit": "mm", "min": [-10.0], "max": [10.0]},
+        "directions": {"kind": "identified"},
     })  # fmt: skip
     for robot, known in ((Robot.preset(), True), (valve, False)):
         draws = told_draws(motion=[1e-6], payload_kg=[0.0])

@@ -39,8 +39,8 @@ LEVEL = 0.95
 # Last part of each run, held out from the fit; rows of each run that are used at most [s of a neck's time]: all of
 # `mixed`, whose parts are different motions.
 _HELD_OUT, _MOST_S = 0.25, 150.0
-# Rows before those held out, from which they are simulated [s of a neck's time].
-_LEAD_S = 20.0
+# Warm-up: rows before those held out, from which they are simulated [s of a neck's time].
+_WARM_UP_S = 20.0
 # Segments of held-out motions: usual, shortest (10, 2.5 time constants) [s of a neck's time], least rows of one.
 _SEGMENT_S, _LEAST_SEGMENT_S, _LEAST_ROWS = 2.0, 0.5, 20
 # Factors on the deviations of the fit, of which the sharpest that explain the held-out motions are taken.
@@ -217,9 +217,9 @@ def make_draws(
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     whole = concatenate(recordings)
     second = ScaledData.of(whole).scaling.second
-    train, held, leads = _split(whole, second)
+    train, held, warm_ups = _split(whole, second)
     sources = _sources(train, lambda done, text: progress(0.7 * done, f"draws: {text}"))
-    motions = _Motions.of(held, sources[0].model, second, leads)
+    motions = _Motions.of(held, sources[0].model, second, warm_ups)
     tried: list[tuple[Vector, Source, float, np.ndarray]] = []
     for number, (source, factor) in enumerate(product(sources, _FACTORS)):
         progress(0.7 + 0.15 * number / (len(sources) * len(_FACTORS)), f"draws: deviations times {factor:g}")
@@ -270,31 +270,31 @@ def _sources(train: Recording, progress: Progress) -> list[Source]:
 
 
 def _split(recording: Recording, second: float) -> tuple[Recording, Recording, list[int]]:
-    """Return the rows to fit and to hold out of each run, and how many of those held out lead in.
+    """Return the rows to fit and to hold out of each run, and how many of those held out are a warm-up.
 
     These are simulated and not judged: before them nothing is known of a robot's hysteresis.
     """
-    most, lead = (round(length * second / recording.sample_time) for length in (_MOST_S, _LEAD_S))
-    train, held, leads = [], [], []
+    most, warm_up = (round(length * second / recording.sample_time) for length in (_MOST_S, _WARM_UP_S))
+    train, held, warm_ups = [], [], []
     for run in recording.runs():
         rows = min(len(run), max(most, 8 * WARM_UP))
         edge = round((1.0 - _HELD_OUT) * rows)
         if edge > 2 * WARM_UP and rows - edge > WARM_UP + _LEAST_ROWS:
             train.append(run.rows(0, edge))
-            leads.append(min(edge, max(lead, WARM_UP)))
-            held.append(run.rows(edge - leads[-1], rows))
+            warm_ups.append(min(edge, max(warm_up, WARM_UP)))
+            held.append(run.rows(edge - warm_ups[-1], rows))
     if not train:
         raise DataError(
             f"no run has {8 * WARM_UP} rows, of which the last quarter could be held out from the draws; record longer."
         )
-    return concatenate(train), concatenate(held), leads
+    return concatenate(train), concatenate(held), warm_ups
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Motions:
     """Held-out motions in segments.
 
-    recording, model: to simulate; outputs: (rows, outputs) measured; groups: (rows,) segment, -1 in what leads in;
+    recording, model: to simulate; outputs: (rows, outputs) measured; groups: (rows,) segment, -1 in the warm-up;
     motion: (segments,) largest motion of an output [SI]; classes: (segments,) of amplitude; noise: (outputs,) standard
     deviation of the sensor [SI], which loops add to every draw: it is no disturbance.
     """
@@ -308,15 +308,15 @@ class _Motions:
     noise: Vector
 
     @classmethod
-    def of(cls, held: Recording, model: Model, second: float, leads: Sequence[int]) -> _Motions:
+    def of(cls, held: Recording, model: Model, second: float, warm_ups: Sequence[int]) -> _Motions:
         usual, least = (round(length * second / held.sample_time) for length in (_SEGMENT_S, _LEAST_SEGMENT_S))
         runs, groups, first = held.runs(), [], 0
         # One run that is shorter than a segment has two halves.
-        rows = len(held) - sum(leads)
+        rows = len(held) - sum(warm_ups)
         length = max(_LEAST_ROWS, usual if rows > usual else max(least, (rows + 1) // 2))
-        for run, lead in zip(runs, leads, strict=True):
-            number = first + (np.arange(len(run)) - lead) // length
-            number[:lead] = -1
+        for run, warm_up in zip(runs, warm_ups, strict=True):
+            number = first + (np.arange(len(run)) - warm_up) // length
+            number[:warm_up] = -1
             first = int(number.max(initial=first)) + 1
             groups.append(number)
         group, y = np.concatenate(groups), held.outputs

@@ -263,13 +263,13 @@ def test_a_noisier_sensor_is_no_larger_disturbance(made: Callable[..., Draws], r
     found, added = made(), np.array([0.004, 0.008])
     assert found.noise.shape == added.shape
     rng = np.random.default_rng(3)
-    _, held, leads = _draws._split(_draws.concatenate(recordings), 1.0)
+    _, held, warm_ups = _draws._split(_draws.concatenate(recordings), 1.0)
     noisy = dict(
         zip(held.robot.outputs.names, (held.outputs + added * rng.normal(size=held.outputs.shape)).T, strict=True)
     )
     loud = replace(held, channels={**held.channels, **noisy})
     draws = [{name: values[k] for name, values in found.arrays.items()} for k in range(20)]
-    before, after = (_draws._Motions.of(each, found.model, 1.0, leads) for each in (held, loud))
+    before, after = (_draws._Motions.of(each, found.model, 1.0, warm_ups) for each in (held, loud))
     # 450 rows tell a deviation to 1 / sqrt(900) = 3 %, fourth differences to about three times that.
     np.testing.assert_allclose(after.noise, np.hypot(before.noise, added), rtol=0.15)
     Y = before.simulate(draws)
@@ -289,8 +289,8 @@ def test_draws_of_a_neck_are_grey_boxes_that_cover_a_new_recording() -> None:
     numbers = np.array([model.arrays["neck"] for model in found.for_certificate()])
     assert (numbers.std(axis=0) > 0.0).sum() >= 12  # all but those that have no meaning here or are held at a bound
     new = record(signal("aprbs", duration=20.0, seed=7), neck, seed=3)
-    _, held, leads = _draws._split(new, 1.0)
-    motions = _draws._Motions.of(held, found.model, 1.0, leads)
+    _, held, warm_ups = _draws._split(new, 1.0)
+    motions = _draws._Motions.of(held, found.model, 1.0, warm_ups)
     Y = motions.simulate([{name: values[k] for name, values in found.arrays.items()} for k in range(20)])
     for row in motions.coverage(Y, found.share, found.keep):
         # A tenth less than the level: twenty draws have a narrower range than the forty of the calibration.
@@ -331,14 +331,14 @@ RLS = Model(kind="rls", sample_time=0.02, arrays={})
 
 
 def test_segments_are_parts_of_a_run_by_the_largest_motion_of_an_output() -> None:
-    """Waves of 50 rows in segments of two seconds; runs begin a segment of their own, behind what leads in."""
+    """Waves of 50 rows in segments of two seconds; runs begin a segment of their own, behind the warm-up."""
     sizes = np.array([0.2, 0.2 * 0.59, 0.2 * 0.61, 0.2 * 0.24, 0.2 * 0.26])
-    lengths, leads = [250, 300], [50, 50]
+    lengths, warm_ups = [250, 300], [50, 50]
     number = np.concatenate([np.full(50, -1), np.arange(200) // 100, np.full(50, -1), 2 + np.arange(250) // 100])
     wave = np.sin(2.0 * np.pi * np.arange(550) / 50.0)
     y = np.column_stack([0.01 * wave, sizes[number] * wave])
     y[130, 0] = np.nan  # a row that misses one output
-    found = _draws._Motions.of(held_out(lengths, y), RLS, 1.0, leads)
+    found = _draws._Motions.of(held_out(lengths, y), RLS, 1.0, warm_ups)
     expected = number.copy()
     expected[130] = -1
     np.testing.assert_array_equal(found.groups, expected)
@@ -363,13 +363,13 @@ def test_the_last_quarter_of_each_run_is_held_out(lengths: list[int], second: fl
         with pytest.raises(DataError, match="no run has 200 rows"):
             _draws._split(recording, second)
         return
-    train, held, leads = _draws._split(recording, second)
-    each = list(zip(train.runs(), held.runs(), leads, strict=True))
-    assert [(len(a), len(b) - lead) for a, b, lead in each] == (parts or [(150, 50)])
-    # 20 s of a neck's time lead in where there are as many, and no fewer rows than a simulation takes to start.
-    assert leads == [min(len(a), max(round(1000 * second), 25)) for a, _, _ in each]
+    train, held, warm_ups = _draws._split(recording, second)
+    each = list(zip(train.runs(), held.runs(), warm_ups, strict=True))
+    assert [(len(a), len(b) - warm_up) for a, b, warm_up in each] == (parts or [(150, 50)])
+    # 20 s of a neck's time are the warm-up where there are as many, and no fewer rows than a simulation takes to start.
+    assert warm_ups == [min(len(a), max(round(1000 * second), 25)) for a, _, _ in each]
     np.testing.assert_array_equal(train.runs()[0].outputs, recording.runs()[0].outputs[: len(train.runs()[0])])
-    last, rows = [run for run in recording.runs() if len(run) > 150][-1], len(train.runs()[-1]) - leads[-1]
+    last, rows = [run for run in recording.runs() if len(run) > 150][-1], len(train.runs()[-1]) - warm_ups[-1]
     np.testing.assert_array_equal(held.runs()[-1].outputs, last.outputs[rows : rows + len(held.runs()[-1])])
 
 
