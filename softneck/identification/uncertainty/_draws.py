@@ -134,6 +134,8 @@ class Draws(ReprMixin):
         if low is not None:
             covered, wanted = 100.0 * low["covered"], 100.0 * self.level
             return f"they cover {covered:.3g} % of {low['class']} motions, not {wanted:.3g} %"
+        if not self.coverage:
+            return "no held-out motion tells what they cover"
         large = self.coverage[-1]
         wide = large["width"] / max(large["motion"], 1e-300)
         return f"they differ by +-{100.0 * wide:.0f} % of {large['class']} motions" if wide > _WIDE else ""
