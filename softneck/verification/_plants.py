@@ -6,6 +6,7 @@ dynamics (for a model of higher order, all but its slowest pole).
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import math
 from collections.abc import Mapping
@@ -209,11 +210,23 @@ def source_of_family(family: Any, name: str) -> PlantSource:
             )
         )  # fmt: skip
     own = np.array([family.axes[axis].nominal[0] for axis in names])
-    cross = np.nan_to_num(off_diagonal(family.cross[:, : len(names)] / own[:, None]))
+    robot = robot_of(family)
     return PlantSource(
-        name=name, sample_time=family.sample_time, axes=tuple(boxes), cross=cross, kind="family",
-        robot=robot_of(family), weights=directions_of(family),
+        name=name, sample_time=family.sample_time, axes=tuple(boxes), kind="family", robot=robot,
+        cross=_known_cross(family.cross[:, : len(names)] / own[:, None], name, robot), weights=directions_of(family),
     )  # fmt: skip
+
+
+def _known_cross(gains: Matrix, name: str, robot: Robot) -> Vector:
+    """Return the gains beside the diagonal; raise SettingsError for one that is not finite: it would count as none."""
+    for axis, row in zip(robot.outputs.names, gains, strict=True):
+        for other, value in zip(robot.input_names, row, strict=True):
+            if not math.isfinite(value):
+                raise SettingsError(
+                    f"{name}: the gain from {other} to {axis} is not known ({value:g} of the axis's own); record runs "
+                    "of 100 samples or more in which every input moves, and identify it again."
+                )
+    return off_diagonal(gains)
 
 
 def off_diagonal(matrix: Matrix) -> Vector:
@@ -238,11 +251,13 @@ def source_of_model(model: Any, name: str, spread: Mapping[str, float]) -> Plant
             plants.append(axis_plant(model, axis))
         except SettingsError as error:
             raise SettingsError(f"{name}: {error}") from error
+        if plants[-1].static_gain == 0.0:
+            raise SettingsError(f"{name}: {axis} has a static gain of 0: no controller holds it at a set-point.")
     if not all(math.isclose(plants[0].sample_time, plant.sample_time, rel_tol=1e-9) for plant in plants):
         raise SettingsError(f"{name}: {' and '.join(names)} have different sample times.")
     return PlantSource(
         name=name, sample_time=plants[0].sample_time, axes=tuple(_axis_of(plant, spread) for plant in plants),
-        cross=_cross_gains(model, plants, robot), kind="model", robot=robot, weights=directions_of(model),
+        cross=_cross_gains(model, plants, name), kind="model", robot=robot, weights=directions_of(model),
     )  # fmt: skip
 
 
@@ -269,18 +284,14 @@ def _axis_of(plant: AxisPlant, spread: Mapping[str, float]) -> AxisBox:
     return AxisBox(nominal=nominal, low=low, high=high, samples=np.zeros((0, 3)), rest=rest)
 
 
-def _cross_gains(model: Any, plants: list[AxisPlant], robot: Robot) -> Vector:
+def _cross_gains(model: Any, plants: list[AxisPlant], name: str) -> Vector:
     """Return the static gains from the other axes' inputs to each axis over its own gain."""
-
-    def gain(axis: str, name: str) -> float:
-        try:
-            return float(np.real(model.tf(axis, input=name).dcgain()))
-        except (SettingsError, TypeError, ValueError):
-            return 0.0  # a model of single axes
-
-    gains = [[gain(axis, name) / plant.static_gain for name in robot.input_names]
+    robot = robot_of(model)
+    if "input" not in inspect.signature(model.tf).parameters:
+        return np.zeros(len(plants) * (len(plants) - 1))  # a model of single axes
+    gains = [[np.real(model.tf(axis, input=other).dcgain()) / plant.static_gain for other in robot.input_names]
              for axis, plant in zip(robot.outputs.names, plants, strict=True)]  # fmt: skip
-    cross = np.nan_to_num(off_diagonal(np.array(gains)), posinf=0.0, neginf=0.0)
+    cross = _known_cross(np.array(gains), name, robot)
     # Remove rounding errors of decoupled axes.
     return np.where(np.abs(cross) < _CROSS_TOLERANCE, 0.0, cross)
 

@@ -42,13 +42,16 @@ def recordings(draw: st.DrawFn) -> Recording:
     return Recording(time, Ts, channels, np.repeat(np.arange(len(runs)), runs))
 
 
-def test_a_delimiter_at_the_end_of_each_line_is_no_channel(tmp_path: Path) -> None:
-    lines = csv_lines(neck_recording(30), 30)
-    (tmp_path / "plain.csv").write_text("\n".join(lines))
-    (tmp_path / "ended.csv").write_text("\n".join(line + "," for line in lines))
-    plain, ended = read_recording(tmp_path / "plain.csv"), read_recording(tmp_path / "ended.csv")
-    assert ended.channels.keys() == plain.channels.keys()
-    np.testing.assert_array_equal(ended.outputs, plain.outputs)
+def test_a_delimiter_at_the_end_of_each_line_is_no_channel_unless_something_stands_behind_it(tmp_path: Path) -> None:
+    lines, path = csv_lines(neck_recording(30), 30), tmp_path / "a.csv"
+    path.write_text("\n".join(lines))
+    plain = read_recording(path)
+    for title in ("", ","):
+        path.write_text("\n".join([lines[0] + title, *[line + "," for line in lines[1:]]]))
+        assert same(read_recording(path), plain)
+    path.write_text("\n".join([f"{line}, {0.5 if k == 9 else ''}" for k, line in enumerate(lines)]))
+    with pytest.raises(DataError, match="column `Unnamed: 6` names no unit"):
+        read_recording(path)
 
 
 # Numbers as loggers print them, and what is not a number at all, which is left to pandas.
@@ -160,12 +163,6 @@ def test_what_is_no_recording_is_one_clear_line(tmp_path: Path, case: str) -> No
         read_recording(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
-
-
-def test_a_trailing_comma_moves_no_column(tmp_path: Path) -> None:
-    lines = csv_lines(neck_recording(150))
-    (tmp_path / "a.csv").write_text("\n".join([lines[0], *[f"{line}," for line in lines[1:]]]))
-    np.testing.assert_allclose(read_recording(tmp_path / "a.csv").time, neck_recording(150).time)
 
 
 def test_a_late_word_in_a_long_file_is_an_error_without_a_warning(tmp_path: Path) -> None:
@@ -356,8 +353,35 @@ def test_a_sensor_without_any_sample_is_named_with_what_to_do(name: str, tmp_pat
     write_recording(tmp_path / "a.csv", silent)
 
 
-def test_blanks_behind_delimiters_belong_to_no_title_and_no_word(tmp_path: Path) -> None:
+WORDS = {"a": [1.5, -2.0], "b": ["NA", "x y"]}
+
+
+@pytest.mark.parametrize(
+    ("text", "form", "expected"),
+    [
+        ("a, b\n1.5, NA\n-2.0, x y\n", TextForm(), WORDS),
+        ("a;b\n1,5;NA\n-2;x y\n", TextForm(delimiter=";", decimal=","), WORDS),
+        ("1.5\tNA\n-2\tx y\n", TextForm(header=False, delimiter="\t"), {"0": WORDS["a"], "1": WORDS["b"]}),
+        ("a  b\n1.5 \t 2\n-2 7\n", TextForm(delimiter="whitespace"), {"a": [1.5, -2.0], "b": [2.0, 7.0]}),
+        ("x\ny,1,2,3\na,b\n1.5,NA\n-2,x y\n", TextForm(skip=2), WORDS),
+        ("x\na,b\ndeg,-\n1.5,NA\n-2,x y\n", TextForm(skip=1, unit_row=True), WORDS),
+        ("a,b\n1.5,\n-2,5\n", TextForm(), {"a": [1.5, -2.0], "b": [np.nan, 5.0]}),
+        ("ä,b\n1.5,NA\n-2,x y\n", TextForm(encoding="latin-1"), {"ä": WORDS["a"], "b": WORDS["b"]}),
+        ("a,b\n1.5,NA\n-2,x y\n", TextForm(encoding="utf-16"), WORDS),
+        ("a,b\n1.5,NA\n-2,x y\n", TextForm(encoding="utf-32"), WORDS),
+    ],
+)  # fmt: skip
+def test_a_table_is_read_by_its_form(text: str, form: TextForm, expected: dict, tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
-    path.write_text("time, pitch, mode\n0.0, 1.5, fast\n0.1, 2.5, slow\n", encoding="utf-8")
-    found = read_table(path, ".csv", TextForm())
-    assert found.to_dict("list") == {"time": [0.0, 0.1], "pitch": [1.5, 2.5], "mode": ["fast", "slow"]}
+    path.write_bytes(text.encode(form.encoding))
+    found = read_table(path, ".csv", form)
+    assert [str(title) for title in found] == list(expected)
+    for (_, cells), values in zip(found.items(), expected.values(), strict=True):
+        np.testing.assert_array_equal(cells, values)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_zeros_make_a_text_none_unless_its_letters_have_them(encoding: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(b"a,b\n1,2\n\0\0\0\0\n")
+    with pytest.raises(FileFormatError, match="is not a text"):
+        read_table(tmp_path / "a.csv", ".csv", TextForm(encoding=encoding))

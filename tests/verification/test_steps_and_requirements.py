@@ -535,6 +535,50 @@ def test_axes_of_a_model_have_one_sample_time_to_a_billionth() -> None:
     unstable = control.TransferFunction([0.1], [1.0, -1.1], TS)
     with pytest.raises(SettingsError, match=r"^m: .*not stable"):
         source_of_model(LinearNeck(a, unstable), "m", SPREAD)
+    with pytest.raises(SettingsError, match="m: roll has a static gain of 0"):
+        source_of_model(LinearNeck(a, control.TransferFunction([0.1, -0.1], [1.0, -1.5, 0.56], TS)), "m", SPREAD)
+
+
+def crossed(row: int, gain: Any) -> Any:
+    """Return a model whose axis `row` follows the other axis's input by `gain`, a static gain or a system."""
+    systems, names = linear_neck(), ("pitch", "roll")
+    other = gain if isinstance(gain, control.TransferFunction) else control.TransferFunction([gain], [1.0], TS)
+
+    def tf(output: str, *, input: str | None = None) -> Any:
+        own = {"pitch": "theta_i", "roll": "phi_i"}[output]
+        away = other if names.index(output) == row else control.TransferFunction([0.0], [1.0], TS)
+        return systems.tf(output) if input in (None, own) else away
+
+    return SimpleNamespace(tf=tf)
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_a_cross_gain_that_is_not_known_is_refused_and_one_that_is_known_counts(row: int) -> None:
+    """Neither NaN nor infinity is no gain; a model of single axes alone has none."""
+    own, towards = linear_neck().tf("pitch").dcgain(), ("phi_i to pitch", "theta_i to roll")[row]
+    whole = family()
+    for value in (math.nan, math.inf, -math.inf):
+        gains = whole.cross.copy()
+        gains[row, 1 - row] = value
+        with pytest.raises(SettingsError, match=rf"^f: the gain from {towards} is not known \({value:g} of .*record"):
+            source_of_family(replace(whole, cross=gains), "f")
+        with pytest.raises(SettingsError, match=rf"^m: the gain from {towards} is not known \({value:g} of .*record"):
+            source_of_model(crossed(row, value), "m", SPREAD)
+    with pytest.raises(SettingsError, match=f"the gain from {towards} is not known"):
+        source_of_model(crossed(row, control.TransferFunction([0.1], [1.0, -1.0], TS)), "m", SPREAD)
+    for share, told in ((0.3, 0.3), (-0.3, -0.3), (2e-6, 2e-6), (-5e-7, 0.0)):
+        expected = np.where(np.arange(2) == row, told, 0.0)
+        np.testing.assert_allclose(source_of_model(crossed(row, share * own), "m", SPREAD).cross, expected, rtol=1e-9)
+    assert source_of_model(linear_neck(), "m", SPREAD).cross.tolist() == [0.0, 0.0]
+
+    def broken(output: str, *, input: str | None = None) -> Any:
+        if input is not None:
+            raise SettingsError("no such input")
+        return linear_neck().tf(output)
+
+    # What goes wrong in a model is told, and is no model of single axes.
+    with pytest.raises(SettingsError, match="no such input"):
+        source_of_model(SimpleNamespace(tf=broken), "m", SPREAD)
 
 
 def test_a_file_of_requirements_is_a_path_and_its_errors_name_it(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def count_wraps(x: Vector, turn: float) -> int:
     if not ((low >= -slack and high <= turn + slack) or (low >= -0.5 * turn - slack and high <= 0.5 * turn + slack)):
         return 0
     rest = np.abs(step[jumps] - turn * np.sign(step[jumps]))
-    usual = float(np.quantile(np.abs(step[~jumps]), 0.99)) if (~jumps).any() else 0.0
+    usual = float(np.quantile(np.abs(step[~jumps]), 0.99))
     return (
         int(jumps.sum()) if rest.max() <= max(_STEP * turn, min(_LONG_STEP_RATIO * usual, _LONGEST_STEP * turn)) else 0
     )
