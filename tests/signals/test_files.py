@@ -165,13 +165,20 @@ def test_what_is_no_recording_is_one_clear_line(tmp_path: Path, case: str) -> No
     assert "\n" not in str(caught.value)
 
 
-def test_a_late_word_in_a_long_file_is_an_error_without_a_warning(tmp_path: Path) -> None:
-    """pandas reads in chunks and warned of mixed types on stderr, beside the one line there may be."""
-    lines = csv_lines(neck_recording(150)) * 1
-    body = lines[1:] * 400
-    (tmp_path / "a.csv").write_text("\n".join([lines[0], *body[:-1], changed([lines[0], body[-1]], 0, 1, "x")[1]]))
-    with pytest.raises(DataError, match="column `motor_setpoint_1` holds `x` at row 59999"):
-        read_recording(tmp_path / "a.csv")
+def test_a_late_word_in_a_large_file_is_an_error_without_a_warning(tmp_path: Path) -> None:
+    """pandas reads 2^20 cells at once and warned of mixed types on stderr, beside the one line there may be."""
+    titles, row = [f"c{j}" for j in range(128)], ",1" * 127
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join([",".join(titles), *[f"1{row}"] * 8200, f"x{row}"]))
+    column = read_table(path, ".csv", TextForm())["c0"]
+    with pytest.raises(DataError, match="column `c0` holds `x` at row 8200"):
+        _files.numbers(column, "c0", missing=True)
+
+
+def test_an_index_of_pandas_is_a_column_of_a_parquet_file(tmp_path: Path) -> None:
+    table = neck_recording(30).to_pandas().set_index("time [s]")
+    table.to_parquet(tmp_path / "a.parquet")
+    assert same(read_recording(tmp_path / "a.parquet"), neck_recording(30))
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.parquet"])

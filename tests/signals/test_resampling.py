@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from softneck.core import DataError
 from softneck.signals import Recording, concatenate, import_log, parse_layout, resampled
 from softneck.signals.importing._log import ImportResult
+from softneck.signals.recording._resampling import low_pass
 
 LAYOUT = """
 [time]
@@ -221,6 +222,24 @@ def test_there_and_back_by_a_faster_sample_time_is_the_identity_on_the_pass_band
     back = resampled(resampled(of(motion, 0.02), 0.02 / ratio), 0.02)
     # The faster grid holds each logged sample; what is left is the ripple of a window of 60 dB, 1e-3.
     assert np.abs(back.outputs[100:-100, 0] - motion[100:-100]).max() < 1e-3 * 0.2
+
+
+@pytest.mark.parametrize("ratio", [1.05, 1.5, 2.0, 3.0, 8.0, 20.0])
+def test_a_low_pass_passes_seven_tenths_of_the_band_and_stops_at_its_end_within_the_shortest_window(
+    ratio: float,
+) -> None:
+    impulse = np.zeros(1001)
+    impulse[500] = 1.0
+    found = low_pass(impulse, ratio)
+    reach = np.flatnonzero(found)[[0, -1]] - 500
+    # Kaiser's length for 60 dB and a transition of 0.3 of the band; the window is symmetric: no delay.
+    order = (60.0 - 7.95) / (2.285 * 0.3 * np.pi / ratio)
+    assert -reach[0] == reach[1] == np.ceil(order / 2.0)
+    gain = np.abs(np.fft.rfft(found, 16384))
+    frequency = np.linspace(0.0, 1.0, gain.size) * ratio  # of the new Nyquist frequency
+    # 60 dB; the sum of the weights is 1, which shifts the pass band by as much as its ripple.
+    assert np.abs(gain[frequency <= 0.7] - 1.0).max() < 1.5e-3
+    assert gain[frequency >= 1.0].max(initial=0.0) < 1.5e-3
 
 
 def test_what_a_slower_grid_cannot_hold_is_filtered_out_and_not_folded_down() -> None:
