@@ -12,11 +12,11 @@ from softneck.core import CheckFailedError, SettingsError, file_hash, read_certi
 from softneck.core._certificate import certificate_contents
 from softneck.cosim import load_loop, simulate
 from softneck.drives import prepare
-from softneck.drives.running._certified import ARMING, SAME, require_certified, require_same_again
+from softneck.drives.running._certified import require_certified, require_same_again
 from softneck.verification import read_requirements
 from softneck.verification._drawn import certified_content
 
-from .certified import drawn_rows, verified_rows, write_verified
+from .certified import ARMING, drawn_rows, verified_rows, write_verified
 from .conftest import STEP, Project
 
 DRIVES = 'profile = "ipos2015"\n' + "".join(f"[[drive]]\nnode = {n}\npeak_current_A = 10.0\n" for n in (1, 2, 3))
@@ -201,11 +201,11 @@ def test_the_loop_has_to_do_again_what_was_certified(project: Project, tmp_path:
     trace = dict(certificate.contents["trace"])
     assert (trace["row"][0], trace["row"][-1], len(trace["row"])) == (0, 199, 50)
     shifted = np.array(trace["motor_setpoint_2"])
-    shifted[30] += 1.5 * SAME
+    shifted[30] += 1.5e-4
     other = edited(project.certificate, tmp_path / "c.json", trace=trace | {"motor_setpoint_2": shifted.tolist()})
     with pytest.raises(CheckFailedError, match=r"does not do again what was certified: `motor_setpoint_2` is"):
         require_same_again(deployed.loop, read_certificate(other))
-    shifted[30] -= SAME
+    shifted[30] -= 1e-4
     other = edited(project.certificate, tmp_path / "d.json", trace=trace | {"motor_setpoint_2": shifted.tolist()})
     require_same_again(deployed.loop, read_certificate(other))
     old = edited(project.certificate, tmp_path / "old.json", trace=None)

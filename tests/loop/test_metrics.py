@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from softneck.core import SettingsError
 from softneck.loop import LoopResult, check_limits, metrics
-from softneck.loop._result import SETTLING_BAND
 
 TS = 0.02
 
@@ -42,7 +41,7 @@ def test_step_metrics_equal_those_of_python_control(damping: float, frequency: f
     system = control.tf([frequency**2], [1.0, 2.0 * damping * frequency, frequency**2])
     time = np.arange(600) * TS
     y = size * np.asarray(control.step_response(system, time).outputs)
-    theirs: Any = control.step_info(y, time, final_output=size, SettlingTimeThreshold=SETTLING_BAND)
+    theirs: Any = control.step_info(y, time, final_output=size, SettlingTimeThreshold=0.05)
     pitch = np.concatenate([np.zeros(late), y])
     reference = np.concatenate([np.zeros(late), np.full(600, size)])
     ours = metrics(result_of(pitch, reference))["pitch"]

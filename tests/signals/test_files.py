@@ -170,7 +170,7 @@ def test_a_late_word_in_a_large_file_is_an_error_without_a_warning(tmp_path: Pat
     titles, row = [f"c{j}" for j in range(128)], ",1" * 127
     path = tmp_path / "a.csv"
     path.write_text("\n".join([",".join(titles), *[f"1{row}"] * 8200, f"x{row}"]))
-    column = read_table(path, ".csv", TextForm())["c0"]
+    column = pd.Series(read_table(path, ".csv", TextForm())["c0"])
     with pytest.raises(DataError, match="column `c0` holds `x` at row 8200"):
         _files.numbers(column, "c0", missing=True)
 

@@ -19,10 +19,6 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block
 from softneck.verification import _experiments, linear_plant
 from softneck.verification._experiments import (
-    _AUDIBLE_SHARE_DOWN,
-    _SMALL_RAD,
-    LEAD_IN_S,
-    REST_S,
     Crossing,
     Experiment,
     LoopUnderTest,
@@ -38,6 +34,9 @@ from softneck.verification._linear import LinearLaw, margins
 from softneck.verification._plants import Plants, all_plants, source_of_family
 
 from .necks import TS, family, linear_neck, pi
+
+# A degree; the lead-in and the time of the step [s] of the neck.
+SMALL_RAD, LEAD_IN_S, REST_S = math.radians(1.0), 1.0, 3.0
 
 
 def over(plants: Plants, row: int, *, cross: float = 0.0) -> LoopUnderTest:
@@ -57,7 +56,7 @@ def over(plants: Plants, row: int, *, cross: float = 0.0) -> LoopUnderTest:
 
 def first(loop: LoopUnderTest, axes: str, what: str) -> float:
     """The first crossing of a small kick from upright."""
-    case = Experiment(loop, axes, what, _SMALL_RAD, (0.0, 0.0))
+    case = Experiment(loop, axes, what, SMALL_RAD, (0.0, 0.0))
     return _first_crossing(case, case.floor(), math.inf, False)
 
 
@@ -113,7 +112,7 @@ def test_the_first_crossing_is_found_where_stability_is_not_monotone(monkeypatch
 
 def test_the_least_over_plants_axes_and_kinds_is_each_metric_s() -> None:
     def crossing(axes: str, what: str, value: float) -> Crossing:
-        return Crossing("p", axes, what, _SMALL_RAD, (0.0, 0.0), value, 0.0)
+        return Crossing("p", axes, what, SMALL_RAD, (0.0, 0.0), value, 0.0)
 
     found = [
         crossing("pitch", "gain_up", 3.0), crossing("pitch", "gain_down", 2.5), crossing("roll", "gain_up", 4.0),
@@ -191,11 +190,11 @@ def test_a_loop_that_feeds_a_kick_oscillates_though_slow_parts_of_its_plant_let_
 ) -> None:
     """Seen on a foreign neck: 3.5 deg from a kick of 1, then 3.1; it was called calm."""
     case = Experiment(
-        over(all_plants([source_of_family(family(), "f")], 2, 0), 0), "both", "gain_up", _SMALL_RAD, (0.0, 0.0)
+        over(all_plants([source_of_family(family(), "f")], 2, 0), 0), "both", "gain_up", SMALL_RAD, (0.0, 0.0)
     )
-    monkeypatch.setattr(Experiment, "_windows", lambda *_: (3.5 * _SMALL_RAD, 3.1 * _SMALL_RAD))
+    monkeypatch.setattr(Experiment, "_windows", lambda *_: (3.5 * SMALL_RAD, 3.1 * SMALL_RAD))
     assert case.oscillates(1.6, 0.0)
-    monkeypatch.setattr(Experiment, "_windows", lambda *_: (2.5 * _SMALL_RAD, 2.1 * _SMALL_RAD))
+    monkeypatch.setattr(Experiment, "_windows", lambda *_: (2.5 * SMALL_RAD, 2.1 * SMALL_RAD))
     assert not case.oscillates(1.6, 0.0)
 
 
@@ -212,7 +211,7 @@ def test_what_sticks_and_comes_late_is_no_oscillation_and_what_runs_away_is_one(
 
 def test_where_a_loop_hunts_at_gain_1_there_is_no_less_to_look_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """It hunts after the small kick and not after the large one: the second divided by a delay of zero."""
-    monkeypatch.setattr(Experiment, "_windows", lambda case, *_: (1.0, 1.0 if case.amplitude == _SMALL_RAD else 0.0))
+    monkeypatch.setattr(Experiment, "_windows", lambda case, *_: (1.0, 1.0 if case.amplitude == SMALL_RAD else 0.0))
     loop = over(all_plants([source_of_family(family(), "f")], 2, 0), 0)
     for overall in (False, True):
         found = crossings([loop], overall=overall)
@@ -227,9 +226,9 @@ def test_a_quieter_loop_oscillates_by_more_than_what_late_axes_do_to_each_other(
     """Seen on a foreign neck: a dip of 0.2 deg as the other axis came late was a gain margin of 1.4."""
     loop = over(all_plants([source_of_family(family(), "f")], 2, 0), 0)
     for size, loud in ((0.2, False), (1.5, True)):
-        monkeypatch.setattr(Experiment, "_windows", lambda *_, size=size: (size * _SMALL_RAD, size * _SMALL_RAD))
-        assert Experiment(loop, "both", "gain_down", _SMALL_RAD, (0.0, 0.0)).oscillates(1.4, 0.0) is loud
-        assert Experiment(loop, "both", "gain_up", _SMALL_RAD, (0.0, 0.0)).oscillates(1.4, 0.0)
+        monkeypatch.setattr(Experiment, "_windows", lambda *_, size=size: (size * SMALL_RAD, size * SMALL_RAD))
+        assert Experiment(loop, "both", "gain_down", SMALL_RAD, (0.0, 0.0)).oscillates(1.4, 0.0) is loud
+        assert Experiment(loop, "both", "gain_up", SMALL_RAD, (0.0, 0.0)).oscillates(1.4, 0.0)
 
 
 def test_each_channel_is_late_louder_and_disturbed_by_its_own_numbers() -> None:
@@ -294,7 +293,7 @@ def test_the_last_two_windows_of_an_experiment_are_compared_over_all_outputs(
     outputs: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(_experiments, "_oscillation", lambda angle, most: float(np.ptp(angle)) + 0.0 * most)
-    rows = round(_experiments._WINDOW_S * 2.0 / TS)
+    rows = round(4.0 * 2.0 / TS)
     time = TS * np.arange(round(2.0 * REST_S / TS) + 3 * rows)
     swing = np.where(np.arange(time.size) % 2, 0.5, -0.5)
     size = np.full(time.size, 9.0)
@@ -329,7 +328,7 @@ def test_the_last_two_windows_of_an_experiment_are_compared_over_all_outputs(
         assert made._windows(2.0, 0.0) == (0.0, math.inf)
 
 
-@pytest.mark.parametrize(("what", "share"), [("gain_up", 0.1), ("delay", 0.1), ("gain_down", _AUDIBLE_SHARE_DOWN)])
+@pytest.mark.parametrize(("what", "share"), [("gain_up", 0.1), ("delay", 0.1), ("gain_down", 1.0)])
 def test_an_oscillation_is_heard_above_a_share_of_the_step_and_twice_the_floor(
     what: str, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

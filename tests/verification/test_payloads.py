@@ -15,7 +15,6 @@ from softneck.loop import LoopResult, RobotReference
 from softneck.plant import NeckParameters
 from softneck.robot import Robot
 from softneck.verification import Scale, _neck_loops, make_requirements
-from softneck.verification._experiments import LEAD_IN_S, REST_S
 from softneck.verification._neck_loops import (
     AroundMiddle,
     SimulationModel,
@@ -129,7 +128,7 @@ def test_a_step_waits_for_what_moves_before_it_in_the_seconds_of_the_robot() -> 
     assert bent.scale.time == pytest.approx(2.0)
     for pull, begin in ((None, 0.5), (0.0, 0.5), (0.3, 3.0)):
         assert step_time(controller_with(pull), neck) == begin
-        assert step_time(controller_with(pull), bent) == pytest.approx(2.0 * REST_S)
+        assert step_time(controller_with(pull), bent) == pytest.approx(6.0)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +153,7 @@ def test_a_reference_about_the_middle_leads_there_first_and_is_cut_off_before_it
     led = AroundMiddle.of(steps, controller_with(), asked)
     assert isinstance(led, AroundMiddle)
     assert led.outputs == pytest.approx((0.2,))
-    assert (led.cocontraction, led.lead) == pytest.approx((0.6, 2.0 * LEAD_IN_S))
+    assert (led.cocontraction, led.lead) == pytest.approx((0.6, 2.0))
     assert led(0.0) == pytest.approx((0.0, 0.0))
     half = led(0.5 * led.lead)
     assert half == pytest.approx((0.1, 0.3))

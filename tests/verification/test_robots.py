@@ -18,7 +18,7 @@ from softneck.loop import BlockPart
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
 from softneck.verification import make_requirements, verify
-from softneck.verification._experiments import _SMALL_RAD, Experiment, LoopUnderTest, _first_crossing, crossings
+from softneck.verification._experiments import Experiment, LoopUnderTest, _first_crossing, crossings
 from softneck.verification._linear import LinearLaw, margins, radii
 from softneck.verification._neck_loops import make_simulation_model
 from softneck.verification._plants import all_plants, mixing_matrix, off_diagonal, source_of_model
@@ -195,7 +195,7 @@ def test_margins_by_experiment_of_a_linear_plant_are_those_of_its_loop(name: str
     )  # fmt: skip
     rest = (0.0,) * len(robot.outputs.names)
     for what, key in (("gain_up", "gain"), ("delay", "delay")):
-        case = Experiment(loop, axis, what, size * _SMALL_RAD, rest)
+        case = Experiment(loop, axis, what, size * math.radians(1.0), rest)
         expected = controller.design[axis]["margins"][key]
         found = _first_crossing(case, case.floor(), math.inf, False)
         # A straight line between two samples is no later, but up to 1.6 % short. The way from 0 bar to the middle

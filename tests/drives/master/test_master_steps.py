@@ -284,3 +284,11 @@ def test_after_a_stop_guarding_ends_while_one_drive_that_was_heard_may_have_powe
     assert master.starved is (heard and unsure)
     master.supervisor.phase = Phase.DONE
     assert not master.starved
+
+
+def test_a_drive_is_given_a_quarter_of_a_second_to_obey_a_stop_before_guarding_ends() -> None:
+    master = new_master()
+    master.supervisor.phase, master.supervisor.since = Phase.STOPPING, 1.0
+    for now, starved in ((1.0, False), (1.25, False), (1.26, True)):
+        master._now = now
+        assert master.starved is starved

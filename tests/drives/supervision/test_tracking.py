@@ -19,7 +19,6 @@ from softneck.drives.supervision._calibrate import _tracking, calibrate, require
 from softneck.drives.supervision._detection import Budget
 from softneck.drives.supervision._motor_models import Motion
 from softneck.drives.supervision._tracking import (
-    _SETTLING_ROWS,
     LoopRun,
     TrackingCharts,
     fit_tracking,
@@ -82,16 +81,14 @@ def test_what_the_loop_is_off_by_itself_counts_for_no_fault() -> None:
 def test_without_a_reference_and_where_tendons_hung_nothing_is_compared() -> None:
     model = fit_tracking([run_of(1), run_of(2)])._replace(thresholds=(10.0,) * 4)
     charts = TrackingCharts(model, 2, TS)
-    for _ in range(_SETTLING_ROWS + 50):
+    for _ in range(150 + 50):
         assert charts.step((), (0.3, 0.3), valid=True) == -1
         assert not charts.scores.any()
     # As long again after it came, and after tendons hung.
-    assert [charts.step((0.0, 0.0), (0.3, 0.3), valid=True) for _ in range(_SETTLING_ROWS)] == [-1] * _SETTLING_ROWS
+    assert [charts.step((0.0, 0.0), (0.3, 0.3), valid=True) for _ in range(150)] == [-1] * 150
     assert max(charts.step((0.0, 0.0), (0.3, 0.3), valid=True) for _ in range(50)) >= 0
     charts.step((0.0, 0.0), (0.3, 0.3), valid=False)
-    assert [charts.step((0.0, 0.0), (0.3, 0.3), valid=True) for _ in range(_SETTLING_ROWS - 1)] == [-1] * (
-        _SETTLING_ROWS - 1
-    )
+    assert [charts.step((0.0, 0.0), (0.3, 0.3), valid=True) for _ in range(150 - 1)] == [-1] * (150 - 1)
     assert charts.step((0.0, 0.0), None, valid=True) == -1
     assert max(charts.step((0.0, 0.0), (0.3, 0.3), valid=True) for _ in range(50)) >= 0
 

@@ -17,8 +17,6 @@ from softneck.identification import Model, Rules, validate
 from softneck.identification.models._scores import nrmse_fit, r_squared, rmse, worst_error
 from softneck.identification.validation import _baselines, _error_statistics, _score_tables
 from softneck.identification.validation._error_statistics import (
-    LAGS,
-    LEVEL,
     ResidualTests,
     _left_out,
     _path,
@@ -32,7 +30,6 @@ from softneck.identification.validation._error_statistics import (
 )
 from softneck.identification.validation._score_tables import (
     INFINITE,
-    RANGES,
     Rows,
     _block_sums,
     block_length,
@@ -54,6 +51,8 @@ SCORES: dict[str, Callable[..., float]] = {
     "fits": nrmse_fit, "r2": r_squared, "rmse_deg": rmse, "worst_deg": lambda y, yhat: worst_error(y, yhat)[0],
 }  # fmt: skip
 TS = 0.02
+# Of the tests of residuals.
+LAGS, LEVEL = 25, 0.99
 
 
 def signals(rows: int = 400) -> tuple[Matrix, Matrix]:
@@ -243,7 +242,7 @@ def test_a_simulation_leaves_after_as_many_ranges_in_any_unit(unit: float) -> No
     for width in (0.6, 0.01):
         y = np.outer(np.linspace(-1.0, 1.0, 50), 0.5 * width * scaled)
         rows = replace(rows_of(y), robot=robot)
-        reach = RANGES * max(width, np.radians(5.0))
+        reach = 3.0 * max(width, np.radians(5.0))
         for share, expected in ((0.999, None), (1.001, rows.time[20])):
             at = y.copy()
             at[20, 1] = share * reach * scaled[1]

@@ -10,10 +10,12 @@ from statsmodels.stats.diagnostic import acorr_ljungbox
 from statsmodels.tsa.stattools import acf, ccf
 
 from softneck.identification import Rls, validate
-from softneck.identification.validation._error_statistics import LAGS, ResidualTests, residual_tests
+from softneck.identification.validation._error_statistics import ResidualTests, residual_tests
 from softneck.signals import concatenate
 
 from ...data import neck_recording
+
+LAGS = 25
 
 
 def noise(rows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
