@@ -83,6 +83,12 @@ def test_it_shows_itself_in_a_line(free: Labelled) -> None:
     assert repr(free).startswith("300 rows over 0 to 5.98 s: pitch [rad], roll [rad]")
     assert len(repr(free).splitlines()) <= 3
     assert repr(free.T).startswith("array(")
+    assert repr(Labelled(np.zeros((0, 1)), np.zeros(0), {"x": "m"})) == "0 rows over no rows: x [m]"
+    # A text of 199 characters is told, of 200 the channels are counted.
+    for letters, told in ((94, f"{'x' * 95} [m], {'y' * 94} [m]"), (95, "2 channels")):
+        units = {"x" * 95: "m", "y" * letters: "m"}
+        text = repr(Labelled(np.zeros((2, 2)), np.array([1.0, 2.5]), units))
+        assert text == f"2 rows over 1 to 2.5 s: {told}"
     with pytest.raises(DataError, match="without its labels"):
         free.T.to_pandas()
 
@@ -90,3 +96,5 @@ def test_it_shows_itself_in_a_line(free: Labelled) -> None:
 def test_labels_that_do_not_fit_are_refused() -> None:
     with pytest.raises(DataError, match="do not fit"):
         Labelled(np.zeros((3, 2)), np.zeros(3), {"pitch": "rad"})
+    with pytest.raises(DataError, match=r"labels of 2 times and 2 channels do not fit \(3, 2\)"):
+        Labelled(np.zeros((3, 2)), np.zeros(2), {"pitch": "rad", "roll": "rad"})

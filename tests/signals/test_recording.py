@@ -8,6 +8,15 @@ import pytest
 from softneck.core import DataError, SettingsError
 from softneck.robot import Robot, Scaling
 from softneck.signals import Recording, concatenate
+from softneck.signals.recording._channels import (
+    column_name,
+    file_unit,
+    is_held,
+    known_channels,
+    may_miss,
+    parse_column,
+    si_unit,
+)
 from softneck.signals.recording._recording import (
     check_rising,
     conditions,
@@ -316,3 +325,62 @@ def test_a_part_is_split_off_where_one_of_its_runs_has_rows_on_both_sides() -> N
     assert ([len(part) for part in head.runs()], [len(part) for part in tail.runs()]) == ([30], [70, 1])
     with pytest.raises(DataError, match=r"1 rows cannot be split at 0\.3"):
         runs.runs()[1].split(0.3)
+
+
+# -- channels ---------------------------------------------------------------------------------------------------------
+
+CART = Robot.from_dict({
+    "name": "cart", "motors": {"names": ["p", "q"], "unit": "kPa"}, "outputs": {"names": ["x"], "unit": "mm"},
+    "directions": {"kind": "matrix", "matrix": [[1.0, -1.0]]},
+})  # fmt: skip
+COMMON = {
+    "cocontraction_reference": "", "compression": "m", "payload": "kg", "payload_estimate": "kg", "push_x": "N",
+    "push_y": "N", "base_tilt_pitch": "deg", "base_tilt_roll": "deg", "innovation": "1", "healthy": "1", "enabled": "1",
+    "measurement_valid": "1",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("robot", "outputs", "motors", "unit", "shown"),
+    [(Robot.preset("neck"), ("pitch", "roll"), "123", "rad", "deg"), (CART, ("x",), "12", "kPa", "mm")],
+)
+def test_a_robot_has_these_channels_in_these_units_held_or_missed(
+    robot: Robot, outputs: tuple[str, ...], motors: str, unit: str, shown: str
+) -> None:
+    ends = ("", "_measured", "_estimate", "_reference", "_lower", "_upper")
+    expected = {"time": "s", **COMMON, "cocontraction_reference": unit, **{f"tension_{j}": "N" for j in motors}}
+    for names, per in ((robot.set_points, unit), (robot.motor_positions, unit), (robot.motor_velocities, f"{unit}/s")):
+        assert len(names) == len(motors)
+        expected |= dict.fromkeys(names, per)
+    expected |= {f"{name}{end}": shown for name in outputs for end in ends}
+    expected |= {f"{name}_rate{end}": f"{shown}/s" for name in outputs for end in ends[:3]}
+    assert {name: file_unit(name, robot) for name in known_channels(robot)} == expected
+    held = {name for name in expected if name.endswith("_reference")} | set(robot.set_points)
+    assert {name for name in expected if is_held(name)} == held | {
+        "payload", "healthy", "enabled", "measurement_valid",
+    }  # fmt: skip
+    missed = {name for name in expected if name.startswith(outputs)} | {f"tension_{j}" for j in motors}
+    missed |= {*robot.motor_positions, *robot.motor_velocities, "compression"}
+    assert {name for name in expected if may_miss(name, robot)} == missed - held
+    for name, own in expected.items():
+        factor = {"deg": np.pi / 180.0, "deg/s": np.pi / 180.0, "kPa": 1e3, "kPa/s": 1e3, "mm": 1e-3, "mm/s": 1e-3}
+        for title, scale in ((column_name(name, robot), factor.get(own, 1.0)), (f" {name} [ {own}] ", None),
+                             (f"{name}[{si_unit(name, robot)}]", 1.0)):  # fmt: skip
+            channel, found = parse_column(title, robot)
+            assert channel == name
+            assert found == pytest.approx(factor.get(own, 1.0) if scale is None else scale, rel=1e-15)
+    for j in motors:
+        assert parse_column(f"motor_setpoint_{j} [{unit}]", robot)[0] == robot.set_points[int(j) - 1]
+
+
+@pytest.mark.parametrize(
+    ("title", "told"),
+    [("x", r"column `x` names no unit; write `x \[mm\]`"), ("y", "names no unit; use `softneck import`"),
+     ("x [mm", "names no unit"), ("[mm]", "names no unit"), ("x [m] [m]", "names no unit"),
+     ("y [mm]", "column `y` is not a channel of a recording of robot `cart`"),
+     ("x [kPa]", "cannot be in `kPa`; expected mm"),
+     ("x []", "unit"), ("motor_setpoint_3 [kPa]", "is not a channel")],
+)  # fmt: skip
+def test_a_title_is_a_known_channel_with_a_unit_of_its_kind(title: str, told: str) -> None:
+    with pytest.raises((DataError, SettingsError), match=told):
+        parse_column(title, CART)

@@ -49,6 +49,26 @@ def test_angles_that_do_not_span_the_plane_are_refused(angles: list[float]) -> N
         redefinition_matrix(np.array(angles))
 
 
+@pytest.mark.parametrize(("determinant", "spans"), [(1.01e-3, True), (0.99e-3, False)])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_angles_span_the_plane_down_to_a_determinant_of_a_thousandth(
+    determinant: float, spans: bool, sign: float
+) -> None:
+    # Two at right angles, the third near the first: (sin a + cos a - 1)/3 = a/3 of a small angle a, all but its square.
+    angles = np.array([0.0, sign * np.pi / 2.0, sign * 3.0 * determinant * (1.0 + 1.5 * determinant)])
+    if spans:
+        assert np.linalg.det(redefinition_matrix(angles)) == pytest.approx(-sign * determinant, rel=1e-4)
+    else:
+        with pytest.raises(SettingsError, match="span the plane"):
+            redefinition_matrix(angles)
+
+
+def test_what_is_zero_but_for_rounding_is_zero() -> None:
+    T = redefinition_matrix(np.radians([0.0, 90.0, 180.0]))
+    assert (T[0, 1], T[1, 2], T[1, 0]) == (0.0, 0.0, 0.0)
+    assert redefinition_matrix(np.array([2e-15, 1.0, 2.0]))[1, 0] == 2e-15
+
+
 @given(i=st.floats(0, 1.5), o=st.floats(-np.pi, np.pi))
 def test_pitch_and_roll_are_the_angles_of_the_tilt_vector(i: float, o: float) -> None:
     """The platform's normal, tilted by scipy about the axis at right angles to the orientation."""
