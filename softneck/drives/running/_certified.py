@@ -28,12 +28,13 @@ ARMING = {
     "sim.slack_s": "tendons stay taut",
 }
 # What shows the same where loops over the draws of a family decided: every draw came to rest and kept the margins, of
-# each axis and of all at once, with payloads and at three amplitudes.
+# each axis and of all at once, with payloads and at three amplitudes. Gain and delay margin, which are asked for
+# anyway, stand for the disk margin together.
 BY_DRAWS = {
-    "stability.radius": ("axes.gain_margin",),
-    "axes.disk_margin": ("axes.gain_margin", "axes.delay_margin_ms"),
-    "step.overshoot_pct": ("sim.overshoot_pct",),
-    "step.load_rms_deg": ("sim.load_rms_deg",),
+    "stability.radius": "axes.gain_margin",
+    "axes.disk_margin": "axes.gain_margin",
+    "step.overshoot_pct": "sim.overshoot_pct",
+    "step.load_rms_deg": "sim.load_rms_deg",
 }
 # Share of plants that draws must speak for, with 95 % confidence: 59 draws do at each of the attempts of a family.
 LEAST_CONTENT = 0.9
@@ -153,9 +154,8 @@ def _require_minimum(found: Certificate, robot: Robot) -> None:
             continue
         why = _why_not_shown(found, metric, defaults)
         if why and neck_metric in by_draws:
-            instead = [scale.name_of(name) for name in by_draws[neck_metric]]
-            missing = [(name, _why_not_shown(found, name, defaults)) for name in instead]
-            metric, why = next(((name, told) for name, told in missing if told), (metric, ""))
+            metric = scale.name_of(by_draws[neck_metric])
+            why = _why_not_shown(found, metric, defaults)
         if why:
             raise CheckFailedError(
                 f"{found.path}: does not show `{metric}` ({what}): {why}. Verify again, {_OVERRIDE_WAY}"
