@@ -224,7 +224,8 @@ def test_a_value_that_is_refused_or_not_kept_fails_its_topic(index: int) -> None
 
 def test_a_negative_number_that_reads_back_as_its_bits_is_kept() -> None:
     rows = Report()
-    for found, holds in ((0xFFFFFFFE, True), (-2, True), (2, False), (-1, False)):
+    flipped = [(0xFFFFFFFE ^ 1 << bit, False) for bit in range(32)]
+    for found, holds in ((0xFFFFFFFE, True), (-2, True), (2, False), (-1, False), *flipped):
         write: Any = Write(0x607D, 1, -2)
         _preflight._apply(Told(kept={0x607D: found}), "limits", [write], rows)  # pyright: ignore[reportArgumentType]
         assert rows.rows[-1].holds is holds
@@ -468,7 +469,8 @@ def test_a_drive_without_an_answer_is_none_that_is_off(monkeypatch: pytest.Monke
         assert _stop.disarm(link_, FILE, "life", ()) == {silent: "no answer"}
         drive.silent = None
         assert _stop.disarm(link_, FILE, "life", ()) == {}
-        for word, state in ((0x0227, "ENABLED"), (0x0208, "FAULT"), (0x0231, "")):
+        for word, state in ((0x0227, "ENABLED"), (0x0208, "FAULT"), (0x0207, "QUICK_STOP"), (0x020F, "REACTION"),
+                            (0x0225, "UNKNOWN"), (0x0200, ""), (0x0221, ""), (0x0233, "")):  # fmt: skip
             drive.table[0x6041, 0] = word
             assert _stop.disarm(link_, FILE, "life", ()) == ({silent: f"it is in {state}"} if state else {})
         drive.table[0x6041, 0] = 0x0250
@@ -614,6 +616,28 @@ def test_both_certificates_must_be_of_the_robot_that_the_drives_move(
         found = _certified.require_certified(setup, Path("c.npz"))
         assert found is not None
         assert [item.path for item in found] == ["verify.json", "simulate.json"]
+
+
+def test_all_that_acts_in_a_run_is_covered_and_the_plant_is_hardware(monkeypatch: pytest.MonkeyPatch) -> None:
+    covered: dict[str, list[Path]] = {}
+
+    def covering(kind: str, given: Any, item: Path, files: list[Path]) -> Any:
+        del given, item
+        covered[kind] = files
+        return SimpleNamespace(path=kind, contents={"duration_s": 5.0, "robot": {"hash": NECK.hash}})
+
+    monkeypatch.setattr(_certified, "_covering", covering)
+    monkeypatch.setattr(_certified, "_require_minimum", lambda *_: None)
+    roles = ("loop", "plant", "controller", "observer", "filter", "reference", "drives")
+    files = {role: (f"{role}.file", "") for role in roles}
+    loop = SimpleNamespace(duration=5.0, controller=SimpleNamespace(sample_time=0.02))
+    setup: Any = SimpleNamespace(files=files, loop=loop)
+    own, drives = Path("mine.npz"), Path("lab/drives.toml")
+    others = {Path(f"{role}.file") for role in roles if role not in ("plant", "controller")}
+    for given in (None, drives):
+        _certified.require_certified(setup, own, drives=given)
+        assert covered["verify"] == [own]
+        assert set(covered["simulate"]) == {own, *others} | ({given} if given else set())
 
 
 def test_arming_asks_for_the_limits_that_verify_stretched_to_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
