@@ -1391,6 +1391,18 @@ def test_a_limit_of_any_motor_is_told_of_the_run_and_lasts_for_its_time(motor: i
     assert [value for k, value in enumerate(master.setpoints) if k != motor] == [0.0, 0.0]
 
 
+def test_time_within_the_limits_is_taken_from_that_beyond_them() -> None:
+    master, far, near = _master(Pilot()), [100.0] * 3, [0.0] * 3
+    # 0.28 s beyond, then long enough within to fall by 0.18 s, of which ten times as much is needed.
+    for wanted, cycles, told in ((far, 28, 0), (near, 180, 0), (far, 19, 0), (far, 3, 1)):
+        events: list[Event] = []
+        for _ in range(cycles):
+            for limiter in master._limiters:
+                limiter.reset(0.0)
+            master._limit(0.0, wanted, events, count=True)
+        assert ("clamp_persistent" in [event.name for event in events]) is bool(told)
+
+
 @pytest.mark.parametrize("at", [-1, 0, 1, 2])
 def test_drives_are_enabled_one_after_the_other_each_in_its_time(at: int) -> None:
     """The run waits for a sample of the sensor once all are; one that does not come is named."""

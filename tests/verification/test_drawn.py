@@ -156,6 +156,7 @@ def test_draws_say_how_many_hold_at_which_attempt() -> None:
     assert drawn(attempt=3).content == pytest.approx((0.05 / 3) ** (1 / 59), rel=1e-12)
     assert drawn().statement() == ("none of 59 draws of f fails: 95.0 % of such plants hold, with 95 % confidence")
     assert drawn(attempt=2).statement().endswith("(attempt 2, which is counted)")
+    assert drawn((58,)).content == 0.0
     bad = drawn((1, 4))
     assert (bad.content, bad.statement()) == (0.0, "2 of 59 draws of f fail")
     doubted = replace(bad, draws=SimpleNamespace(doubt="they differ"))  # pyright: ignore[reportArgumentType]
