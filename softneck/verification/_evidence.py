@@ -369,5 +369,5 @@ def _neck_describer(evidence: Evidence, controller: ControllerUnderTest, asked: 
 def worst_row(values: Mapping[str, Values], metric: str, bound: str) -> int:
     """Return the row of the worst value of a metric: NaN first, then the smallest for "min", else the largest."""
     found = values[metric].values
-    # Of numpy's, both take the first NaN.
+    # Both take the first NaN.
     return int(np.argmin(found) if bound == "min" else np.argmax(found))

@@ -95,7 +95,9 @@ class _Task:
         self.radius = worst("stability.radius", [self.radius, *size])
         peaks = found.difference[:, list(self.axes)].max(axis=1)
         # The radius of unstable loops, else the peak of |S - T|, which is infinite at the stability limit.
-        return -np.where(size >= 1.0, _UNSTABLE_BADNESS * size, np.minimum(peaks, _UNSTABLE_BADNESS))
+        return -np.where(
+            size >= 1.0, _UNSTABLE_BADNESS * size, np.where(peaks < _UNSTABLE_BADNESS, peaks, _UNSTABLE_BADNESS)
+        )
 
 
 def _evolve(function: Callable[[Matrix], Vector], unknowns: int, generations: int, seed: int) -> Vector:

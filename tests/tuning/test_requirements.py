@@ -383,7 +383,8 @@ def test_the_default_rise_is_that_of_the_slowest_axis() -> None:
     slow, quick = rise(1.0, 1.0), rise(POLE, POLE)
     assert slow > 1.4 * quick
     assert rise(1.0, POLE) == rise(POLE, 1.0) == slow
-    assert rise(POLE, POLE, delay=60) > quick
+    late = [LinearNeck(pitch=axis(POLE), roll=axis(POLE)), LinearNeck(pitch=axis(POLE), roll=axis(POLE, 60))]
+    assert default_rise(late, asked) == rise(POLE, POLE, delay=60) > quick
     assert rise(POLE, POLE, more=(POLE,)) == quick
     assert rise(40.0, 40.0) >= USUAL_RISE * TIME_CONSTANT
     short = make_tune_requirements({"sim": {"size_deg": 15.0}, "require": {"sim.settling_s": {"max": 0.3}}})

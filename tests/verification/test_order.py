@@ -825,6 +825,36 @@ def test_mu_is_the_largest_bound_and_the_searched_radius_the_largest_met(monkeyp
     check_worst("stability.radius", of)
 
 
+@pytest.mark.parametrize("axes", [(0,), (1,), (0, 1)])
+def test_a_search_goes_for_the_worst_of_its_axes_and_for_unstable_loops_first(
+    axes: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    peaks: Any = SimpleNamespace(
+        difference=np.array([[2.0, 5.0], [7.0, 3.0], [math.inf] * 2, [math.nan] * 2, [1.0, 1.0]])
+    )
+    radius = np.array([0.9, 0.8, 0.99, 0.7, 1.2])
+    monkeypatch.setattr(_structured, "loops_of", lambda *_, **__: (peaks, radius))
+    task = _Task(source_of_family(family(), "f"), 0, axes, LinearLaw.of(CONTROLLER().ss(), Robot.preset()), 0)
+    found = task.badness(np.full((3 * len(axes), 5), 0.5))
+    assert found[:2].tolist() == {(0,): [-2.0, -7.0], (1,): [-5.0, -3.0], (0, 1): [-5.0, -7.0]}[axes]
+    assert found[4] < found[3] == found[2] == -1e3
+    assert task.radius == 1.2
+
+
+def test_a_gain_margin_is_the_smaller_of_both_directions_of_each_axis(monkeypatch: pytest.MonkeyPatch) -> None:
+    ones = np.ones((3, 2))
+    made: Any = SimpleNamespace(
+        gain=np.array([[3.0, 4.0], [1.5, math.inf], [math.inf, 9.0]]),
+        gain_down=np.array([[0.5, 0.0], [0.5, 0.2], [0.0, 0.125]]), more=np.ones((3, 3)),
+        **dict.fromkeys(("sensitivity", "complementary", "difference", "phase", "delay"), ones),
+    )  # fmt: skip
+    monkeypatch.setattr(_linear, "loops_of", lambda *_: (made, np.zeros(3)))
+    plants = nominal_plants([source_of_family(family(), "f")])[0].take(np.array([0, 0, 0]))
+    found = margins(plants, LinearLaw.of(CONTROLLER().ss(), Robot.preset()))
+    assert found["pitch.gain_margin"].tolist() == [2.0, 1.5, math.inf]
+    assert found["roll.gain_margin"].tolist() == [4.0, 5.0, 8.0]
+
+
 def test_an_oscillation_is_the_largest_of_all_outputs() -> None:
     y = np.array([0.0, 1.0, 0.2, 0.9, 0.1])
     assert _experiments._oscillation(y, 10.0) == pytest.approx(0.9)

@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -310,6 +311,12 @@ def test_bad_input_is_told_in_words(files: dict[str, Path]) -> None:
             'version = 1\n[require]\n"axes.gain_margin" = { min = 3.0 }\n"pitch.gain_margin" = { max = 2.5 }',
             r"`pitch\.gain_margin` cannot be at least 3 and at most 2\.5",
         ),
+        *((f'version = 1\n[require]\n{least}\n{more}', r"`roll\.gain_margin` cannot be at least 3 and at most 2\.5")
+          for least, more in permutations(('"axes.gain_margin" = { min = 3.0 }',
+                                           '"roll.gain_margin" = { min = 1.5, max = 2.5 }'))),
+        *((f'version = 1\n[require]\n{tight}\n{wide}', r"`roll\.sensitivity` cannot be at least 2 and at most 1\.5")
+          for tight, wide in permutations(('"axes.sensitivity" = { max = 1.5 }',
+                                           '"roll.sensitivity" = { min = 2.0, max = 3.0 }'))),
         ('version = 1\n[require]\n"step.rise_s" = { min = 3.0 }', "cannot rise in 3 s or more and settle within 2 s"),
         (
             'version = 1\n[require]\n"axes.sensitivity" = { max = 1.5 }\n"axes.gain_margin" = { max = 2.5 }',
