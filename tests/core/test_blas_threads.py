@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from typing import cast
 
 import pytest
 import scipy.linalg  # noqa: F401  (its BLAS is one of those that are counted)
@@ -16,7 +17,7 @@ from softneck.core._kinds import KINDS, kinds_of, make_settings, resolve
 from softneck.identification import FamilySettings
 from softneck.identification.selection._auto import choose
 from softneck.plant._calibration import calibrate
-from softneck.signals import Recording
+from softneck.signals import Recording, assess_quality
 from softneck.tuning import tune
 from softneck.verification import verify
 
@@ -27,6 +28,13 @@ _OUTSIDE = 2
 
 class _AskedError(Exception):
     """Ends a fit once its threads are counted."""
+
+
+class _AskedRecording:
+    """Whatever is read first of it counts the threads."""
+
+    def __getattr__(self, _: str) -> object:
+        raise _AskedError(_threads())
 
 
 def _threads() -> set[int]:
@@ -59,10 +67,11 @@ def test_a_fit_has_one_blas_thread(kind: str, neck: Recording) -> None:
         lambda neck: FamilySettings().fit(neck, progress=_count_and_stop),
         lambda neck: choose(*neck.split(0.7), kinds=["rls"], progress=_count_and_stop),
         lambda neck: calibrate([neck], [0.0], progress=_count_and_stop),
+        lambda _: assess_quality(cast("Recording", _AskedRecording())),
         lambda _: verify(pi(), linear_neck(), progress=_count_and_stop),
         lambda _: tune({"neck": linear_neck()}, kinds=["pi"], budget=1, workers=0, progress=_count_and_stop),
     ],
-    ids=["family", "auto", "calibrate", "verify", "tune"],
+    ids=["family", "auto", "calibrate", "quality", "verify", "tune"],
 )
 def test_what_searches_or_verifies_has_one_too(call: Callable[[Recording], object], neck: Recording) -> None:
     with pytest.raises(_AskedError) as told:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, ReprMixin, require_positive, to_si
+from softneck.core import Matrix, ReprMixin, one_blas_thread, require_positive, to_si
 from softneck.robot import TIME_CONSTANT, Robot, Scaling
 
 from ..recording._recording import Recording
@@ -148,6 +148,7 @@ class Quality(ReprMixin):
         return lines
 
 
+@one_blas_thread
 def assess_quality(recording: Recording, *, bandwidth: float | None = None) -> Quality:
     """Assess a recording's channels and the excitation by its inputs; no check crosses the border of two runs.
 
