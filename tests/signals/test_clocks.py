@@ -213,7 +213,11 @@ def test_a_clock_jitters_where_long_steps_of_all_lengths_stand_and_not_where_it_
 
 
 @pytest.mark.parametrize(("steps", "gaps"), [(1.5, []), (1.5 + 2.0**-20, [49])])
-def test_a_step_of_half_more_than_the_usual_is_no_gap_and_a_longer_one_is(steps: float, gaps: list[int]) -> None:
-    # Times are exact in binary, so that the step is at the border.
-    time = 0.25 * (np.arange(100) + (steps - 1.0) * (np.arange(100) > 49))
+@pytest.mark.parametrize("other", [1.0, 1.25])
+def test_a_step_of_half_more_than_the_usual_is_no_gap_and_a_longer_one_is(
+    steps: float, gaps: list[int], other: float
+) -> None:
+    # Times are exact in binary, so that the step is at the border, alone or beside one that is a bit long.
+    k = np.arange(100)
+    time = 0.25 * (k + (steps - 1.0) * (k > 49) + (other - 1.0) * (k > 70))
     assert find_gaps(Samples(time, np.zeros(100, dtype=np.int64), {}))[0].nonzero()[0].tolist() == gaps

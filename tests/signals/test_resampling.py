@@ -185,6 +185,10 @@ def test_a_recording_goes_to_another_sample_time_and_its_runs_stay_apart() -> No
     np.testing.assert_array_equal(same.outputs, run.outputs)
     with pytest.raises(DataError, match=r"a run of 100 rows at 0\.021 s has no two samples 5 s apart"):
         resampled(both, 5.0)
+    ten = of(truth(0.25 * np.arange(11)), 0.25)
+    assert len(resampled(ten, 2.5)) == 2
+    with pytest.raises(DataError, match="no two samples"):
+        resampled(ten, np.nextafter(2.5, 3.0))
 
 
 def of(outputs: np.ndarray, sample_time: float, set_points: np.ndarray | None = None) -> Recording:
