@@ -30,6 +30,8 @@ def test_it_is_the_array_that_it_was(free: Labelled, models: dict[str, Model], n
     for made in (free - plain, free.mean(axis=0), np.abs(free), 2 * free, free == plain, np.sqrt(free**2)):
         assert getattr(made, "channels", ()) == () or made.shape == free.shape
     assert float(np.abs(free - plain).max()) == 0.0
+    assert isinstance(np.add.reduce(free, axis=None), np.float64)
+    assert isinstance(free.max(), np.float64)
     assert free.T.shape == plain.T.shape
     assert np.concatenate([free, free]).shape == (2 * len(plain), plain.shape[1])
     again = pickle.loads(pickle.dumps(free))  # noqa: S301  as workers are sent it: a plain array

@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 from softneck.core import DataError
 from softneck.signals import Recording, concatenate, import_log, parse_layout, resampled
 from softneck.signals.importing._log import ImportResult
-from softneck.signals.recording._resampling import low_pass
+from softneck.signals.recording._resampling import (
+    Samples,
+    low_pass,
+    mean_step,
+    resample,
+    split_at_gaps,
+    without_duplicates,
+)
 
 LAYOUT = """
 [time]
@@ -55,6 +62,7 @@ def test_a_band_limited_signal_is_recovered_from_jittered_samples(tmp_path: Path
     assert np.abs(r.outputs[:, 0] - truth(r.time)).max() < 0.5e-3
 
 
+@settings(max_examples=25)
 @given(Ts=st.sampled_from([0.001, 0.01, 1 / 30, 0.021, 0.1, 1.0]), start=st.floats(-10, 1000), rows=st.integers(12, 60))
 def test_even_times_pass_bit_for_bit(tmp_path: Path, Ts: float, start: float, rows: int) -> None:
     time = start + Ts * np.arange(rows)
@@ -109,6 +117,70 @@ def test_gaps_split_and_short_pieces_are_dropped_with_a_note(tmp_path: Path) -> 
         "1 piece(s) between gaps, 5 rows, dropped: shorter than 10 samples",
     )
     np.testing.assert_array_equal(done.recording.outputs[:, 0], truth(TS * np.delete(k, np.arange(50, 55))))
+
+
+@pytest.mark.parametrize(
+    "runs", [[[12, 5, 10]], [[5], [20, 9, 10]], [[9, 10], [4]], [[4, 9]], [[12], [11]], [[4, 13, 4], [13, 4]]], ids=str
+)
+def test_pieces_beside_a_gap_are_runs_of_their_own_if_they_have_ten_samples_and_others_stay(
+    runs: list[list[int]],
+) -> None:
+    """In each run pieces of so many rows at 0.25 s, with 1 s between them; a run without a gap may be short."""
+    lengths = [size for pieces in runs for size in pieces]
+    number = np.repeat(np.repeat(np.arange(len(runs)) * 3, [len(pieces) for pieces in runs]), lengths)
+    step = np.full(sum(lengths), 0.25)
+    step[np.cumsum([0, *lengths[:-1]])] = 1.0
+    samples = Samples(np.cumsum(step), number, {"x": np.arange(step.size) * 1.0})
+    kept = [size >= 10 or len(pieces) == 1 for pieces in runs for size in pieces]
+    gaps = len(lengths) - len(runs)
+    if not any(kept):
+        with pytest.raises(DataError, match=rf"`time` has {gaps} gaps \(steps of 1 s and more\) and no 10 samples"):
+            split_at_gaps(samples)
+        return
+    found, notes = split_at_gaps(samples)
+    rows = np.repeat(kept, lengths)
+    np.testing.assert_array_equal(found.time, samples.time[rows])
+    np.testing.assert_array_equal(found.channels["x"], np.flatnonzero(rows))
+    if not gaps:
+        assert (found, notes) == (samples, ())
+        return
+    assert found.run.tolist() == [k for k, size in enumerate([s for s, k in zip(lengths, kept, strict=True) if k])
+                                  for _ in range(size)]  # fmt: skip
+    first = int(np.flatnonzero((np.diff(samples.time) > 0.5) & (np.diff(number) == 0))[0]) + 1
+    at = f"the first at row {first} (t = {samples.time[first]:g} s)"
+    assert notes[0] == f"{gaps} gap(s) in the time column, the longest 1 s, {at}: each starts a new run"
+    lost = kept.count(False)
+    assert notes[1:] == ((f"{lost} piece(s) between gaps, {step.size - rows.sum()} rows, dropped: shorter than 10 "
+                          "samples",) if lost else ())  # fmt: skip
+    assert mean_step(found) == 0.25
+
+
+def test_an_instant_that_is_logged_has_its_sample_and_the_shift_is_to_the_nearest() -> None:
+    time, run = np.array([0.0, 1.0, 2.25, 3.0, 4.0, 0.0, 1.0]), np.array([5, 5, 5, 5, 5, 7, 7])
+    x = np.array([1.0, 2.0, 4.0, np.nan, 8.0, -1.0, -3.0])
+    found, shift = resample(Samples(time, run, {"pitch": x, "motor_setpoint_1": time}), 1.0)
+    assert (found.time.tolist(), found.run.tolist()) == ([0.0, 1.0, 2.0, 3.0, 4.0, 0.0, 1.0], [5] * 5 + [7] * 2)
+    assert shift == 0.25
+    assert found.channels["motor_setpoint_1"].tolist() == [0.0, 1.0, 1.0, 3.0, 4.0, 0.0, 1.0]
+    y = found.channels["pitch"]
+    np.testing.assert_array_equal(y[[0, 1, 3, 4, 5, 6]], x[[0, 1, 3, 4, 5, 6]])
+    assert 2.0 < y[2] < 4.0
+    # Between samples of which one is missed there is none, and one alone is held where it is.
+    one = resample(Samples(time[:3], run[:3], {"pitch": np.array([np.nan, 3.0, np.nan])}), 0.5)[0].channels["pitch"]
+    np.testing.assert_array_equal(one, [np.nan, np.nan, 3.0, np.nan, np.nan])
+
+
+@pytest.mark.parametrize(("rule", "kept"), [("first", [0, 1, 3, 4, 5]), ("last", [0, 2, 3, 4, 5])])
+def test_one_of_two_rows_of_one_time_is_kept_and_runs_may_begin_at_the_same(rule: str, kept: list[int]) -> None:
+    samples = Samples(np.array([0.0, 1.0, 1.0, 2.0, 2.0, 3.0]), np.array([0, 0, 0, 0, 1, 1]), {"x": np.arange(6.0)})
+    found, notes = without_duplicates(samples, rule)
+    assert found.channels["x"].tolist() == kept
+    assert found.run.tolist() == samples.run[kept].tolist()
+    assert notes == ("1 row(s) left out: their time stamp occurs twice, the first time at row 2",)
+    with pytest.raises(DataError, match=r"stands still at row 2: 1 s occurs twice \(1 such row\(s\)\)"):
+        without_duplicates(samples, None)
+    again, none = without_duplicates(found, None)
+    assert (again, none) == (found, ())
 
 
 def test_nothing_is_bridged_between_pieces(tmp_path: Path) -> None:
