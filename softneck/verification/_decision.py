@@ -26,12 +26,13 @@ def metric_words(metric: str) -> str:
 
 
 def certificate_values(file: str, content: Values) -> dict[str, Any]:
-    """Return the JSON values of a certificate: its controller, what fails, what does not decide."""
+    """Return the JSON values of a certificate: its controller, what fails, what does not decide, what draws say."""
     rows = required_rows(content)
     controller = content.get("files", {}).get("controller", {}).get("path", "")
     return {"file": file, "of": str(content.get("certificate")), "controller": str(controller),
             "kind": str(content.get("controller_kind", "")), **verdict_values(rows),
             "drives": has_drives(content.get("units", ())),
+            "draws": [f"Of its draws: {part['statement']}." for part in content.get("draws", ())],
             "holds": certifies(content)}  # fmt: skip
 
 

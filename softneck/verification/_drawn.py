@@ -200,9 +200,7 @@ def _run_all(
             bounds = [item for item in asked.bounds if item.metric == metric]
             for value, condition in found:
                 values.setdefault(metric, []).append(value)
-                conditions.setdefault(metric, []).append(
-                    {"name": f"{plants[number].name}, {condition}", "draw": number}
-                )
+                conditions.setdefault(metric, []).append({"name": condition, "draw": number})
                 if not all(item.holds(value) for item in bounds):
                     failed.add(number)
     # A gain raised and one lowered are two margins: the slow loop of a lower gain swings longer, and may never fail.
@@ -254,12 +252,13 @@ def _payloads(plant: SimulationModel, asked: Requirements) -> tuple[float, ...]:
 
 
 def _steps(task: _Task, number: int) -> dict[str, list[tuple[float, str]]]:
-    """Return metric -> value and condition of every step of a draw."""
+    """Return metric -> value and condition, which the draw's name begins, of every step of a draw."""
     asked, plant, robot = task.asked, task.plants[number], task.asked.robot
-    angles = asked.sim["orientations_deg"] if len(robot.outputs.names) > 1 else [0.0]
+    several = len(robot.outputs.names) > 1
+    angles = asked.sim["orientations_deg"] if several else [0.0]
     found: dict[str, list[tuple[float, str]]] = {}
     for kg, angle in product(_payloads(plant, asked), angles):
-        words = [f"{kg:g} kg"] * bool(plant.payload) + [f"{angle:g} deg"] * (len(robot.outputs.names) > 1)
+        words = [plant.name, *[f"{kg:g} kg"] * bool(plant.payload), *[f"{angle:g} deg"] * several]
         for metric, value in _step(task, plant, number, kg, math.radians(angle)).items():
             found.setdefault(metric, []).append((value, ", ".join(words)))
     return found

@@ -239,10 +239,10 @@ def verification_page(found: Verification, controller: str, certificate: str = "
 
 def verification_decision(contents: Mapping[str, Any], certificate: str) -> str:
     """Return the decision of `verify` from its JSON; `certificate` is the name of the file."""
-    said = certificate_decision(certificate_values(certificate or "its certificate", contents))
+    values = certificate_values(certificate or "its certificate", contents)
     plants, loops = contents["plants"]["count"], contents["virtual_neck_loops"]
-    drawn = "".join(f" Of its draws: {part['statement']}." for part in contents["draws"])
-    return f"{said} Judged against {plants} linear plants and in {loops} simulated loops.{drawn}"
+    judged = f"Judged against {plants} linear plants and in {loops} simulated loops."
+    return " ".join([certificate_decision(values), judged, *values["draws"]])
 
 
 def _requirements_section(found: Verification, certificate: str, stepped: Chart) -> Section:

@@ -251,8 +251,9 @@ def test_an_experiment_is_recorded_logged_and_replayed(tmp_path: Path, count: in
     channels = dict(zip(moved.set_points, wave.T, strict=True)) | dict.fromkeys(moved.outputs.names, 0.0 * t)
     write_recording(tmp_path / "signal.csv", Recording(t, TS, channels, robot=moved))
     played = Experiment(
-        signal=str(tmp_path / "signal.csv"), limits=drive_limits(file), ramp=0.2, robot=moved, ranges=file.ranges
-    )
+        signal=str(tmp_path / "signal.csv"), limits=drive_limits(file), ramp=0.2, cocontraction=0.02, robot=moved,
+        ranges=file.ranges,
+    )  # fmt: skip
     with RunLogger(tmp_path / "run.mcap", wait=True) as log:
         session = Session(file=file, link=link_to(file), log=log, facts={"record": played.facts()})
         result = record_signal([one for one, _ in played.prepare_runs()], session)
@@ -292,6 +293,12 @@ def test_signals_by_name_are_those_of_the_robot_within_its_ranges() -> None:
     ((excitation, _),) = played.prepare_runs()
     assert excitation.set_points.shape == (400, 4)
     assert np.abs(excitation.set_points).max() <= 6.0
+    # Between the ramps of 2 s, which are longer where a motor has to go further, all are moved by the common position.
+    slow, taut = (
+        replace(played, signal="rotation", cocontraction=common).prepare_runs()[0][0].set_points[120:280]
+        for common in (0.0, 0.4)
+    )
+    np.testing.assert_allclose(taut, slow + 0.4, rtol=1e-12)  # rounding
 
 
 # -- sensors ----------------------------------------------------------------------------------------------------------

@@ -215,6 +215,9 @@ def test_a_project_decides_on_model_controller_and_next_step() -> None:
         "tune/best.npz (hinf) holds all 1 requirements of best.certificate.json. Next: run it on drives with that "
         "certificate (`softneck drives --help`), or open tune/tuner.html to trade speed for caution."
     )
+    # What loops over draws say, with the doubt about them, comes last.
+    drawn = certificate_values("best.certificate.json", {**certificate(0), "draws": [{"statement": "2 of 59 fail"}]})
+    assert project_decision(models, [drawn], tuner="tune/tuner.html") == f"{said} Of its draws: 2 of 59 fail."
     # A robot in pressures has no CANopen drives: its controller is exported.
     pressures = {**certificate(0), "units": ["kPa", "deg"]}
     said = project_decision([], [certificate_values("c.json", pressures)], tuner=None)

@@ -34,12 +34,16 @@ _RAMP_S = 2.0
 @click.option("--duration", type=float, metavar="S", help="Length in seconds. [default: the signal's own]")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 200), default=0, show_default=True, help="Seed of the signal.")
 @click.option("--max-position", type=float, metavar="RAD", help="Clip set-points to +-RAD. [default: drives file]")
+@click.option(
+    "--cocontraction", type=float, default=0.0, show_default=True, metavar="RAD",
+    help="Played around this common position of all motors, which keeps tendons taut.",
+)  # fmt: skip
 @click.option("--payload", type=float, default=0.0, metavar="KG", help="Payload on the platform of --simulated.")
 @drives_options("override", "pace", "log")
 @common_options("force")
 def record_command(
     asked: Asked, signal_name: str, output: Path, duration: float | None, seed: int, max_position: float | None,
-    payload: float,
+    cocontraction: float, payload: float,
     force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Record SIGNAL on the drives."""
@@ -51,7 +55,7 @@ def record_command(
     moved, limits = chosen.file.robot, drives.drive_limits(chosen.file, position=max_position)
     experiment = drives.Experiment(
         signal=signal_name, limits=limits, duration=duration, seed=seed, ramp=_RAMP_S,
-        robot=moved,
+        cocontraction=cocontraction, robot=moved,
         ranges=() if moved is None else chosen.file.ranges,
     )  # fmt: skip
     prepared = experiment.prepare_runs()

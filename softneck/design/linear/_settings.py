@@ -365,10 +365,9 @@ class AxisSettings(LoopSettings, ABC):
             nonlocal best
             found = _try_build(build, speed)
             peak = math.inf if found is None else self._sensitivity(found.controller, axis)
-            if not peak <= self.max_sensitivity:
-                return 1.0 / self.max_sensitivity - (1.0 / peak if peak > 0.0 else 0.0)
-            best = found
-            return 1.0 / self.max_sensitivity - 1.0 / peak
+            if peak <= self.max_sensitivity:
+                best = found
+            return 1.0 / self.max_sensitivity - (1.0 / peak if peak > 0.0 else 0.0)
 
         begin = excess(low)
         if best is None:

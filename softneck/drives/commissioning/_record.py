@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import CheckFailedError, DataError, FileFormatError, SettingsError, Vector
+from softneck.core import CheckFailedError, DataError, FileFormatError, SettingsError, Vector, require_finite
 from softneck.robot import Robot
 from softneck.signals import (
     NECK,
@@ -199,6 +199,7 @@ class Experiment:
         seed: of the first run; it rises by one with each.
         runs: how often it is played.
         ramp: from rest and to it [s].
+        cocontraction: common position of all motors, around which it is played [rad].
         robot: whose motors they are; None: a neck's, not spoken of.
         ranges: of each motor: lowest and highest set-point [rad], largest speed [rad/s]; () for none beside `limits`.
     """
@@ -209,6 +210,7 @@ class Experiment:
     seed: int = 0
     runs: int = 1
     ramp: float = 2.0
+    cocontraction: float = 0.0
     robot: Robot | None = None
     ranges: tuple[tuple[float, float, float], ...] = ()
 
@@ -219,7 +221,12 @@ class Experiment:
             SettingsError: no such signal, or limits that it cannot keep.
             FileFormatError, DataError: no such recording, or one of another robot.
         """
-        signals = [one for number in range(self.runs) for one in self._signals(number)]
+        require_finite("cocontraction", self.cocontraction, "rad")
+        signals = [
+            replace(one, set_points=one.set_points + self.cocontraction)
+            for number in range(self.runs)
+            for one in self._signals(number)
+        ]
         return [prepare(self._in_range(one), self.limits, ramp_s=self.ramp) for one in signals]
 
     def _signals(self, number: int) -> list[Excitation]:
