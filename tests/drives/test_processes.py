@@ -1,7 +1,7 @@
 """Faults of real processes: drives, inclinometer and host on UDP multicast in a network namespace of their own.
 
 End states are exact and told by the drives' process. Time bounds are generous (500 ms), for the machine that runs the
-tests is nobody's own; `benchmarks/drives_processes.py` measures.
+tests is nobody's own.
 """
 
 from __future__ import annotations
