@@ -28,7 +28,7 @@ from softneck.drives.master._limiter import Limiter
 from softneck.drives.master._master import Master, Measurement
 from softneck.drives.master._settings import LimitSettings, WatchSettings
 from softneck.drives.master._supervisor import ACTIVE, Signal
-from softneck.drives.master._watches import Patience, Watches, timing
+from softneck.drives.master._watches import Watches, timing
 from softneck.drives.running import _bus_loop, _certified, _pilot, _preflight, _stop
 from softneck.drives.running._bus_loop import RunEnd, Session
 from softneck.drives.running._certified import _as_strict, require_same_again
@@ -1223,12 +1223,6 @@ def test_a_ramp_arrives_where_every_motor_is_at_rest_long_enough_and_at_a_sample
     assert master.supervisor.phase is Phase.RUNNING
 
 
-def test_a_condition_is_reported_once_it_lasted_for_its_time_and_begins_anew_after_a_gap() -> None:
-    patience = Patience(0.2)
-    told = [patience.over(1.0 + 0.1 * k, k != 4) for k in range(8)]
-    assert told == [False, False, True, True, False, False, False, True]
-
-
 def test_a_run_begins_without_a_missing_set_point_and_an_error_has_its_time() -> None:
     master = _master(Pilot(start=ValueError("no")))
     master._missing, master._index, master._now = 3, 7, 42.0
@@ -1300,8 +1294,8 @@ CYCLE = MasterSettings(counts_per_radian=(1.0,)).bus
 
 @pytest.mark.parametrize(
     ("gap", "name"),
-    [(1.0, ""), (1.499, ""), (1.501, "late_cycle"), (CYCLE.stalled_cycles - 0.01, "late_cycle"),
-     (CYCLE.stalled_cycles + 1e-6, "stalled"), (0.0, "clock"), (-1.0, "clock"), (math.nan, "clock"), (1e-6, "")],
+    [(1.0, ""), (1.499, ""), (1.501, "late_cycle"), (4.99, "late_cycle"),
+     (5.0 + 1e-6, "stalled"), (0.0, "clock"), (-1.0, "clock"), (math.nan, "clock"), (1e-6, "")],
 )  # fmt: skip
 def test_the_time_between_two_steps(gap: float, name: str) -> None:
     found = timing(10.0 + gap * CYCLE.cycle, 10.0, CYCLE)

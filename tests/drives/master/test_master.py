@@ -209,7 +209,6 @@ def test_the_drive_watches_its_following_error() -> None:
 # -- fuzzing ----------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=100, deadline=None)
 @given(cycles=st.lists(FRAMES, max_size=6), begun=st.booleans())
 def test_no_frame_crashes_the_master(cycles: list[list[Frame]], begun: bool) -> None:
     master = new_master()
@@ -239,7 +238,6 @@ def test_no_frame_and_no_sample_crash_a_run(running: Bench, frames: list[Frame],
     assert all(math.isfinite(value) for value in running.master.setpoints)
 
 
-@settings(max_examples=200, deadline=None)
 @given(
     wanted=st.lists(st.floats(-20.0, 20.0), min_size=1, max_size=60),
     tension=st.floats(0.5, 3.0),

@@ -82,17 +82,6 @@ def test_what_leaks_fills_in_its_limit_and_empties_ten_times_as_slowly() -> None
     assert [leaky.over(True) for _ in range(30)] == [False] * 29 + [True]
 
 
-@pytest.mark.parametrize(("beyond", "within"), [(2, 19), (1, 9)])
-def test_a_limit_held_for_more_than_a_tenth_of_the_time_fills_in_the_end(beyond: int, within: int) -> None:
-    """The balance: time beyond against a tenth of the time within."""
-    full = Leaky(0.3, T)
-    assert any(full.over(True) if k % (beyond + within) < beyond else full.over(False) for k in range(10_000))
-    # Two per thousand more calm than the balance: never full.
-    calm = Leaky(0.3, T)
-    period = beyond * 11 + 1
-    assert not any(calm.over(k % period < beyond) for k in range(10_000))
-
-
 # -- watches ----------------------------------------------------------------------------------------------------------
 
 

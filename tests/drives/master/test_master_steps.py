@@ -69,13 +69,7 @@ def test_counts_become_radians_and_currents_newtons_with_their_signs() -> None:
     assert [struct.unpack("<Hi", frame.data)[1] for frame in sent[:3]] == [101 + 15435, 101 - 7000, 101 + 15435]
 
 
-@pytest.mark.parametrize(
-    ("gap", "told"),
-    [
-        (1.0, ""), (1.49, ""), (1.51, "late_cycle"), (4.99, "late_cycle"), (5.01, "stalled"), (0.0, "clock"),
-        (-1.0, "clock"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("gap", "told"), [(1.49, ""), (5.01, "stalled")])
 def test_the_time_between_two_steps_is_judged_in_cycles(gap: float, told: str) -> None:
     bench = Bench().start()
     before = dict(bench.master.counts)
