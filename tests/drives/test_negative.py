@@ -29,7 +29,7 @@ from softneck.drives.master._master import Master, Measurement
 from softneck.drives.master._settings import LimitSettings, WatchSettings
 from softneck.drives.master._supervisor import ACTIVE, Signal
 from softneck.drives.master._watches import Watches, timing
-from softneck.drives.running import _bus_loop, _certified, _pilot, _preflight, _stop
+from softneck.drives.running import _bus_loop, _certified, _deploy, _pilot, _preflight, _stop
 from softneck.drives.running._bus_loop import RunEnd, Session
 from softneck.drives.running._certified import _as_strict, require_same_again
 from softneck.drives.running._pilot import LoopPilot, SignalLog, SignalPilot, raised_cosine
@@ -968,6 +968,20 @@ def test_whatever_ends_a_run_the_drives_are_switched_off(
     blind = Session(file=FILE, link=link)
     with pytest.raises(SettingsError, match="need an inclinometer"):
         _bus_loop._run_session(blind, Pilot(), 0.02, 9.0, None, told)
+
+
+def test_disturbances_of_a_loop_act_on_simulated_drives_and_set_points_are_the_controllers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told: dict[str, float] = {}
+    monkeypatch.setattr(_deploy, "LoopPilot", lambda *_: SimpleNamespace(sample_time=0.02))
+    monkeypatch.setattr(_deploy, "simulated_plant", lambda *_, **__: SimpleNamespace(set=told.update))
+    monkeypatch.setattr(_deploy, "VirtualLink", lambda virtual: virtual)
+    monkeypatch.setattr(_deploy, "_run", lambda _deployed, _pilot, session, _report: session)
+    loop = SimpleNamespace(plant_inputs={"payload": 0.5, "motor_setpoint_2": 1.0, "push_x": -2.0}, plant_parameters={})
+    deployed: Any = SimpleNamespace(loop=loop, neck=None)
+    _deploy.run_simulated(deployed, FILE)
+    assert told == {"payload": 0.5, "push_x": -2.0}
 
 
 def test_the_end_of_a_run_in_numbers() -> None:

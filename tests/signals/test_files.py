@@ -374,6 +374,7 @@ WORDS = {"a": [1.5, -2.0], "b": ["NA", "x y"]}
         ("a  b\n1.5 \t 2\n-2 7\n", TextForm(delimiter="whitespace"), {"a": [1.5, -2.0], "b": [2.0, 7.0]}),
         ("x\ny,1,2,3\na,b\n1.5,NA\n-2,x y\n", TextForm(skip=2), WORDS),
         ("x\na,b\ndeg,-\n1.5,NA\n-2,x y\n", TextForm(skip=1, unit_row=True), WORDS),
+        ("a,b\ndeg,-\n1.5,NA\n-2,x y\n", TextForm(unit_row=True), WORDS),
         ("a,b\n1.5,\n-2,5\n", TextForm(), {"a": [1.5, -2.0], "b": [np.nan, 5.0]}),
         ("ä,b\n1.5,NA\n-2,x y\n", TextForm(encoding="latin-1"), {"ä": WORDS["a"], "b": WORDS["b"]}),
         ("a,b\n1.5,NA\n-2,x y\n", TextForm(encoding="utf-16"), WORDS),

@@ -271,6 +271,9 @@ def test_a_recording_is_scaled_where_it_has_units_and_nowhere_else() -> None:
     without = scale_recording(Recording.from_arrays(1e3 * t[:, None], robot=robot), scaling)
     assert not without.has_motor_positions
     neck = neck_recording(100)
+    some = {name: c for name, c in neck.channels.items() if name != "motor_position_2"}
+    partly = scale_recording(Recording(neck.time, TS, some), scaling)
+    assert set(partly.channels) == {*neck.robot.set_points, *neck.robot.outputs.names}
     assert scale_recording(neck, Scaling.of(neck.robot)) is neck
 
 
