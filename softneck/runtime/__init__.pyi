@@ -14,6 +14,7 @@ from ._bundle import sized_name as sized_name
 from ._bundle import split_members as split_members
 from ._casadi_walk import step_function as step_function
 from ._compile import COMPILE_OPTIONS as COMPILE_OPTIONS
+from ._compile import cache_folder as cache_folder
 from ._compile import compiled_name as compiled_name
 from ._compile import have_numba as have_numba
 from ._compile import load_linked as load_linked

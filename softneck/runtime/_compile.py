@@ -205,7 +205,7 @@ def _shorten_shape_errors() -> None:
 
 def _import_text(text: str, *, compiled: bool) -> ModuleType:
     name = compiled_name(text)
-    path = _cache_folder() / f"{name}.py"
+    path = cache_folder() / f"{name}.py"
     # numba compiles again when a file is written again.
     if not path.is_file() or path.read_text(encoding="utf-8", errors="replace") != text:
         with atomic_write(path, force=True) as temporary:
@@ -220,7 +220,8 @@ def _import_text(text: str, *, compiled: bool) -> ModuleType:
     return namespace
 
 
-def _cache_folder() -> Path:
+def cache_folder() -> Path:
+    """Return the folder of runtimes and their compiled code."""
     folder = Path(platformdirs.user_cache_dir("softneck", appauthor=False)) / "runtime" / numba_cache_name("softneck")
     try:
         folder.mkdir(parents=True, exist_ok=True)

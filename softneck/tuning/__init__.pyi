@@ -3,6 +3,7 @@ from ._tune import tune as tune
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
 from ._judge import LEVELS as LEVELS
+from ._judge import judge_candidate as judge_candidate
 from ._requirements import check_feasibility as check_feasibility
 from ._search import Candidate as Candidate
 from ._task import circle_angles as circle_angles

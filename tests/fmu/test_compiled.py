@@ -96,7 +96,7 @@ def test_a_compiled_state_where_numba_is_switched_off_goes_on_with_a_warning(
 
 def test_fmus_keep_compiled_code_beside_softnecks_and_under_other_names(tmp_path: Path) -> None:
     """Functions of one name that two compilers have made call each other's, with other arguments: a process crashed."""
-    ours, theirs = _compile._cache_folder(), _slave_compiled._fmu_cache_folder()
+    ours, theirs = _compile.cache_folder(), _slave_compiled._fmu_cache_folder()
     assert ours.parent == theirs.parent
     assert (ours.name.partition("-")[0], theirs.name.partition("-")[0]) == ("softneck", "fmu")
     text = "def step(a, q, x, u, y):\n    x[0] += u[0]\n"

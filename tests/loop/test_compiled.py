@@ -195,7 +195,7 @@ def test_a_part_with_an_advance_of_its_own_is_called(
 
 def test_a_step_that_the_rows_compile_first_may_allocate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Rows count no references to arrays; numba hands its options down to what it compiles meanwhile.
-    monkeypatch.setattr(_compile, "_cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(_compile, "cache_folder", lambda: tmp_path)
     steps = _compile._import_text("import numpy as np\n\ndef step(n):\n    return np.zeros(n).size\n", compiled=True)
     rows = _compile._import_text("def rows(n):\n    return step(n)\n", compiled=True)
     _compile._compile(steps, ("step",))
@@ -213,7 +213,7 @@ def test_numba_resolves_each_call_once_for_our_functions_and_as_ever_for_others(
         resolved.append((function, args))
         return usual(function, context, args, kws)
 
-    monkeypatch.setattr(_compile, "_cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(_compile, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(_numba_inner, "_CALLS", {})
     monkeypatch.setattr(BaseFunction, "get_call_type", counted)
     text = "def inner(x, y):\n    return x * y * x\n\ndef power(x, y):\n    return inner(x, y) * x * y * x * y\n"
@@ -272,7 +272,7 @@ def test_compiled_functions_free_what_they_make_and_hold_what_they_return(
     from numba.core.runtime import _nrt_python  # pyright: ignore[reportAttributeAccessIssue]
     from numba.core.runtime.nrt import rtsys
 
-    monkeypatch.setattr(_compile, "_cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(_compile, "cache_folder", lambda: tmp_path)
     made, plain = (_compile._import_text(_BORROWING, compiled=True) for _ in range(2))
     _compile._compile(made, ("work", "rest", "quick"))
 

@@ -44,6 +44,7 @@ class Step:
         settings: repeats the step when it changes; the command if empty.
         resumes: file of an interrupted run, from which it continues without `--force`.
         beside: later steps that read nothing of it or of those between: they begin with it, on another core.
+        compiles: recordings, of a step beside which the functions of later steps are compiled; see `compile_ahead`.
     """
 
     stage: str
@@ -55,6 +56,7 @@ class Step:
     settings: str = ""
     resumes: str = ""
     beside: tuple[Step, ...] = ()
+    compiles: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
@@ -215,7 +217,7 @@ def _models(recordings: list[str], options: Options) -> Iterator[Step]:
     family = Step(stage="identification", command=words, makes=(FAMILY,), reads=tuple(recordings),
                   unmet=Unmet.DONE_WITHOUT)  # fmt: skip
     yield Step(stage="identification", command=command, makes=(AUTO,), reads=tuple(recordings), unmet=Unmet.NO_MODEL,
-               beside=(family,))  # fmt: skip
+               beside=(family,), compiles=tuple(recordings))  # fmt: skip
     require_known(Robot.read("robot.toml"))
     linear = linear_model()
     command = ("softneck", "design", "pi", linear, "-o", PI, "--force")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import json
 import os
@@ -11,13 +12,15 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any
 
 import click
 
+import softneck
 from softneck.core import (
     MOST_JSON,
     CheckFailedError,
@@ -28,11 +31,14 @@ from softneck.core import (
     SoftneckError,
     atomic_write,
     file_hash,
+    load,
     settings_text,
 )
+from softneck.robot import Robot
+from softneck.runtime import cache_folder
 
 from ..shared._console import note
-from ._plan import STAGES, Step, Unmet
+from ._plan import FAMILY, PI, STAGES, Step, Unmet, linear_model, nonlinear_model
 
 #: In the folder: finished steps with their inputs, commands and results.
 FILE = "start.json"
@@ -88,6 +94,9 @@ class ProjectRun:
         if not kept:
             for other in step.beside:
                 self._begin(other)
+            if step.compiles and _core_count() > 1 and not _compiled_before().is_file():
+                code = f"from {__name__} import compile_ahead; compile_ahead{step.compiles!r}"
+                self.begun["compile ahead"] = _Process.of(["-c", code])
             begun = bool(same and entry and not entry.get("ended"))
             self.done[step.key] = {
                 "command": step.shown,
@@ -120,7 +129,8 @@ class ProjectRun:
     def _begin(self, step: Step) -> None:
         """Begin a step in a process of its own, if it is to be done and there is a core for it."""
         if step.key not in self.begun and not self._is_done(step) and _core_count() > 1:
-            self.begun[step.key] = _Process.of(step, as_json=self.as_json)
+            words = ["-m", *step.command, *(["--json"] if self.as_json else [])]
+            self.begun[step.key] = _Process.of(words, step.makes, _hashes(step))
 
     def _was_begun(self, step: Step) -> bool:
         """Wait for a step that has begun and tell what it said; return whether it needs no other run.
@@ -173,11 +183,12 @@ class _Process:
     said: tuple[IO[bytes], IO[bytes]]
 
     @classmethod
-    def of(cls, step: Step, *, as_json: bool) -> _Process:
+    def of(cls, words: list[str], makes: tuple[str, ...] = (), reads: dict[str, str] | None = None) -> _Process:
         said = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115 - until the step has its turn
-        words = [sys.executable, "-P", "-m", *step.command, *(["--json"] if as_json else [])]
-        running = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=said[0], stderr=said[1])
-        return cls(running, step.makes, _hashes(step), said)
+        running = subprocess.Popen(
+            [sys.executable, "-P", *words], stdin=subprocess.DEVNULL, stdout=said[0], stderr=said[1]
+        )
+        return cls(running, makes, reads or {}, said)
 
     def finish(self, step: Step, *, as_json: bool) -> bool:
         """Wait until it ends, and print what it said; return whether it ended well on the files of now."""
@@ -201,6 +212,47 @@ class _Process:
         """Close the files with what it said."""
         for stream in self.said:
             stream.close()
+
+
+def compile_ahead(*recordings: str) -> None:
+    """Compile what the steps after the models call, in a process that no step waits for, with the lowest priority.
+
+    Run are an observer and the loops of one controller, over the model of the draws and over that of the loops, when
+    they are there; the steps then load the functions from the cache.
+    """
+    from softneck import estimation, signals, tuning
+
+    getattr(os, "nice", int)(19)
+    family = _await(FAMILY)
+    observer = estimation.KalmanSettings().design(family)
+    fitted = estimation.fit_observer(observer, [signals.read_recording(name) for name in recordings], set())
+    estimation.consistency(fitted.observer, signals.read_recording(recordings[0]))
+    bare = replace(family, draws=None)  # with draws, margins would be those of 59
+    for model in [] if family.draws is None else [family.draws.model, None]:
+        if model is None:
+            _await(PI)
+        task = tuning.task_of([bare, model or load(nonlinear_model() or linear_model())], None, 0)
+        for level in reversed(tuning.LEVELS):  # margins first: the search needs their loops last
+            tuning.judge_candidate(task, "pi", {}, level)
+    _compiled_before().touch()
+
+
+def _await(name: str) -> Any:
+    """Return the content of a file when it is there; end if the process that began this one ended before."""
+    parent = os.getppid()
+    while not Path(name).is_file():
+        time.sleep(0.2)
+        if os.getppid() != parent:
+            sys.exit(1)
+    return load(name)
+
+
+def _compiled_before() -> Path:
+    """Return a file that is there if a run for as many motors and outputs has compiled these runtimes."""
+    robot = Robot.read("robot.toml")
+    content = [path.read_bytes() for path in sorted(Path(softneck.__file__).parent.rglob("*_runtime.py"))]
+    sizes = f"{len(robot.motors.names)}_{len(robot.outputs.names)}"
+    return cache_folder() / f"start_{sizes}_{hashlib.sha256(b''.join(content)).hexdigest()[:16]}"
 
 
 def _core_count() -> int:

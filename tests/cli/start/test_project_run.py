@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +18,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
+import softneck
 from softneck.cli.start import _plan, _project_run, _start
 from softneck.core import CheckFailedError, SettingsError
 from softneck.robot import Robot
@@ -161,6 +162,79 @@ def test_a_step_that_has_no_turn_leaves_no_file(call: Call, short: Path, monkeyp
     monkeypatch.setattr(_start, "steps", beside(_start.steps, "robot", "new", "copy.toml", "--preset", "arm"))
     assert call("start", "log.csv", "-o", "p", "--yes").code == 2
     assert not Path("p").exists()
+
+
+@pytest.mark.parametrize(("cores", "before", "begun"), [(1, False, 0), (2, True, 0), (2, False, 1)])
+def test_functions_are_compiled_ahead_on_another_core_once_and_no_longer_than_the_run(
+    call: Call, short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int, before: bool, begun: int
+) -> None:
+    made: list[Any] = []
+    plan = _start.steps
+
+    def changed(asked: Any) -> Iterator[Any]:
+        first, second, third = plan(asked)
+        yield from (first, replace(second, compiles=("a.csv", "b.csv")), third)
+
+    def waits(words: list[str], **more: Any) -> Any:
+        assert words[-1].endswith("compile_ahead('a.csv', 'b.csv')")
+        made.append(popen([sys.executable, "-c", "import time; time.sleep(60)"], **more))
+        return made[-1]
+
+    monkeypatch.setattr(_project_run, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(_project_run, "_core_count", lambda: cores)
+    monkeypatch.setattr(_project_run.subprocess, "Popen", waits)
+    monkeypatch.setattr(_start, "steps", changed)
+    if before:
+        monkeypatch.setattr(_project_run, "_compiled_before", lambda: short)
+    assert states(call) == [False] * 3
+    assert len(made) == begun
+    assert all(one.returncode for one in made), "it was ended"
+
+
+def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tuning, estimation = SimpleNamespace(LEVELS=("linear", "margins")), SimpleNamespace()
+    ran: list[tuple[Any, ...]] = []
+    tuning.task_of = lambda plants, *_: plants
+    tuning.judge_candidate = lambda task, _kind, _, level: ran.append((*task[1:], level, Path(_plan.PI).exists()))
+    estimation.KalmanSettings = lambda: SimpleNamespace(design=lambda family: ran.append((family.draws.model,)))
+    estimation.fit_observer = lambda *_: SimpleNamespace(observer=None)
+    estimation.consistency = lambda *_: None
+    asked: list[float] = []
+
+    def comes(_: float) -> None:
+        asked.append(1.0)
+        Path(_plan.PI).parent.mkdir(exist_ok=True)
+        Path(_plan.FAMILY if len(asked) == 1 else _plan.PI).touch()
+
+    call("robot", "new", "robot.toml", "--preset", "neck")
+    Path("models").mkdir()
+    monkeypatch.setattr(softneck, "tuning", tuning)
+    monkeypatch.setattr(softneck, "estimation", estimation)
+    monkeypatch.setattr(_project_run.os, "nice", int)
+    monkeypatch.setattr(_project_run.time, "sleep", comes)
+    monkeypatch.setattr(_project_run, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(softneck.signals, "read_recording", lambda name: name)
+    monkeypatch.setattr(_project_run, "load", lambda name: _Family() if name == _plan.FAMILY else "best")
+    _project_run.compile_ahead("log.csv")
+    # The search needs the loops of margins last, so these are compiled first: then the two cores do different ones.
+    assert ran == [("drawn",), ("drawn", "margins", False), ("drawn", "linear", False), ("best", "margins", True),
+                   ("best", "linear", True)]  # fmt: skip
+    assert _project_run._compiled_before().is_file()
+
+
+@dataclass(frozen=True)
+class _Family:
+    draws: Any = field(default_factory=lambda: SimpleNamespace(model="drawn"))
+
+
+def test_what_is_compiled_ahead_ends_with_the_run_that_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    parents = iter([7, 7, 1])
+    monkeypatch.setattr(_project_run.os, "getppid", lambda: next(parents))
+    monkeypatch.setattr(_project_run.time, "sleep", lambda _: None)
+    with pytest.raises(SystemExit):
+        _project_run._await("never.npz")
 
 
 @pytest.fixture
