@@ -984,6 +984,31 @@ def test_disturbances_of_a_loop_act_on_simulated_drives_and_set_points_are_the_c
     assert told == {"payload": 0.5, "push_x": -2.0}
 
 
+def test_each_fiftieth_sample_reports_what_is_done_and_each_goes_into_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    logged, told = list[Any](), list[float]()
+    log = SimpleNamespace(take=lambda _now, master, _truth: master.index, finish=lambda _: (None, None, ("n",)))
+    monkeypatch.setattr(_deploy, "RunLog", lambda *_, **__: log)
+
+    def ran(session: Session, *_: Any, **__: Any) -> Any:
+        for index, runs in ((0, True), (0, False), (1, True), (50, True), (100, False), (150, True), (250, True)):
+            for watch in session.watches:
+                watch(0.0, (), (), None, SimpleNamespace(index=index, ran=runs))  # pyright: ignore[reportArgumentType]
+        master = SimpleNamespace(supervisor=SimpleNamespace(phase="done", fault=None, rehome=False), counts={"left": 1},
+                                 events=[], cycle=9, settings=SimpleNamespace(bus=CYCLE))  # fmt: skip
+        return SimpleNamespace(master=master, wall_time=1.0, times=None, terminated=True, error=None)
+
+    monkeypatch.setattr(_deploy, "run_session", ran)
+    closed: list[int] = []
+    pilot: Any = SimpleNamespace(sample_time=0.02, close=lambda: closed.append(1))
+    deployed: Any = SimpleNamespace(loop=SimpleNamespace(duration=4.0), notes=("m",))
+    session: Any = Session(file=FILE, link=None, log=SimpleNamespace(signals=logged.append, path=Path("a/b")))  # pyright: ignore[reportArgumentType]
+    found = _deploy._run(deployed, pilot, session, told.append)
+    assert told == [0.0, 0.25, 0.75, 1.0]
+    assert logged == [0, 1, 50, 150, 250]
+    assert (found.notes, found.counts, found.cycles, found.cycle) == (("m", "n"), {"left": 1}, 9, CYCLE.cycle)
+    assert (found.terminated, found.simulated, closed) == (True, False, [1])
+
+
 def test_the_end_of_a_run_in_numbers() -> None:
     master: Any = Led()
     master.supervisor.phase = Phase.DONE
