@@ -349,6 +349,23 @@ def test_a_sensor_on_the_bus_is_started_and_told_by_its_number(
 # -- the report -------------------------------------------------------------------------------------------------------
 
 
+def test_what_is_known_of_the_robot_is_told_and_that_nothing_watches_unknown_directions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(_preflight, "limits_said", lambda *_: ("a", "b"))
+    for weights, watched in ((((1.0, -1.0),), True), ((), False)):
+        file: Any = SimpleNamespace(moves=_cart(), limits=None, nodes=(4, 7), weights=weights, load=0.314, bit_rate=5e5)
+        rows = Report()
+        _preflight._tell_robot(file, rows)
+        told = [(row.node, row.name, row.found) for row in rows.rows]
+        assert told == [
+            (0, "robot", _cart().label()), (4, "set-points", "a"), (7, "set-points", "b"),
+            *([] if watched else [(0, "diverged", "not watched: the robot's directions are to be identified")]),
+            (0, "bus load", "31 % of 500000 bit/s at worst"),
+        ]  # fmt: skip
+        assert rows.holds
+
+
 def test_one_row_that_fails_refuses_unless_it_is_let_pass_by_name() -> None:
     rows = Report(("firmware",))
     rows.add(1, "present", "x", True, "advice")
