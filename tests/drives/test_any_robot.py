@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -37,6 +37,7 @@ from softneck.drives.commissioning._record import drive_limits
 from softneck.drives.logs._cycle import decode_cycle, encode_cycle
 from softneck.drives.logs._run_log import RunLogger
 from softneck.drives.master import Frame
+from softneck.drives.running import _virtual
 from softneck.drives.running._bus_loop import Session
 from softneck.drives.running._certified import _require_robot
 from softneck.drives.running._deploy import Deployment
@@ -46,6 +47,7 @@ from softneck.drives.sensing._sources import CanInclinometer, PythonInclinometer
 from softneck.drives.simulated import SimulatedNeck
 from softneck.drives.simulated._springs import SimulatedSprings
 from softneck.loop import Loop
+from softneck.plant import NeckParameters
 from softneck.robot import Robot
 from softneck.runtime import Port
 from softneck.signals import Recording, read_recording, write_recording
@@ -180,6 +182,64 @@ def test_simulated_drives_turn_the_virtual_plant_of_a_preset(name: str) -> None:
     for _ in range(10):
         plant.move()
     assert len(plant.sample(0.1).values) == len(Robot.preset(name).outputs.names)
+
+
+# What grows with a parameter of the neck, to which power; all else stays: (tension, slack, tightening current).
+GROWS = {
+    "pretension": (0, 1, 1), "current_limit": (1, 0, 0), "gear_ratio": (1, 0, -1), "winch_radius": (-1, 0, 1),
+    "torque_constant": (1, 0, -1), "gear_efficiency": (1, 0, -1), "position_limit": (0, 0, 0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GROWS)
+def test_drives_of_a_neck_keep_their_proportions(name: str) -> None:
+    paper = NeckParameters.paper()
+    before = neck_drives(paper)
+    assert before == default_drives()
+    changed = paper.replace(**{name: 0.8 * getattr(paper, name)})
+    file = neck_drives(changed)
+    ratios = (file.limits.tension / before.limits.tension, file.limits.slack / before.limits.slack,
+              file.zero.current / before.zero.current)  # fmt: skip
+    np.testing.assert_allclose(ratios, [0.8**power for power in GROWS[name]], rtol=1e-12)
+    # How far the neck tilts: the watch's gain and tolerance, and how far a tendon may be let out, all alike.
+    tilts = file.watch.gain / before.watch.gain
+    assert tilts == pytest.approx(1.0, rel=0.3)
+    assert (tilts == 1.0) is (name == "position_limit")
+    assert file.watch.tilt / before.watch.tilt == pytest.approx(tilts, rel=1e-12)
+    assert file.limits.slack_unwind / before.limits.slack_unwind == pytest.approx(tilts, rel=1e-12)
+    assert file.limits.position == min(before.limits.position, changed.position_limit)
+    assert (file.neck.winch_radius, file.neck.torque_constant, file.neck.efficiency) == (
+        changed.winch_radius, changed.torque_constant, changed.gear_efficiency,
+    )  # fmt: skip
+    assert {(drive.current_limit, drive.scale.gear) for drive in file.drives} == {
+        (changed.current_limit, changed.gear_ratio)
+    }
+    assert neck_drives(paper.replace(position_limit=9.0)).limits.position == before.limits.position
+
+
+def test_springs_and_drives_are_those_of_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    file = default_drives(robot=robot(2))
+    scales = [replace(d.scale, gear=3.0 + k, counts_per_turn=500 + k, peak_current=1.0 + k, slow_loop=0.001 * (k + 1),
+                      reversed=bool(k)) for k, d in enumerate(file.drives)]  # fmt: skip
+    drives = tuple(replace(d, scale=s, current_limit=0.1 + k) for k, (d, s) in
+                   enumerate(zip(file.drives, scales, strict=True)))  # fmt: skip
+    file = replace(file, drives=drives)
+    for name in ("SimulatedSettings", "SpringSettings", "SimulatedSprings"):
+        monkeypatch.setattr(_virtual, name, lambda *args, **named: named or args)
+    springs, found = cast("Any", simulated_springs(file, sample_time=TS, seed=5, homed=None))
+    assert found == {
+        "nodes": file.nodes, "profile": file.profile, "gear": (3.0, 4.0), "counts_per_turn": (500, 501),
+        "reversed": (False, True), "peak_current": (1.0, 2.0), "slow_loop": (0.001, 0.002), "sample_time": TS,
+        "cycle": file.cycle, "hold": TS, "seed": 5,
+    }  # fmt: skip
+    weights = springs.pop("weights")
+    np.testing.assert_allclose(weights, file.watch.gain * np.array(robot(2).weights()))
+    assert springs == {
+        "outputs": robot(2).outputs.names, "pole": file.watch.pole, "torque_constant": file.neck.torque_constant,
+        "reach": tuple(max(-low, high) for low, high, _ in file.ranges), "efficiency": file.neck.efficiency,
+        "current_limit": (0.1, 1.1), "winch_radius": file.neck.winch_radius, "pretension_current": file.zero.current,
+        "noise_std": pytest.approx(1e-5),
+    }  # fmt: skip
 
 
 def test_springs_stand_for_a_robot_without_a_plant_and_say_so() -> None:
