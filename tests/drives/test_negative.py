@@ -38,6 +38,7 @@ from softneck.drives.running._stop import require_reset, require_stopped
 from softneck.drives.running._timing import Ask
 from softneck.drives.running._virtual import VirtualRun
 from softneck.loop import Loop
+from softneck.plant import NeckParameters
 from softneck.robot import Robot
 from softneck.signals import NECK
 
@@ -999,6 +1000,28 @@ def test_disturbances_of_a_loop_act_on_simulated_drives_and_set_points_are_the_c
     deployed: Any = SimpleNamespace(loop=loop, neck=None)
     _deploy.run_simulated(deployed, FILE)
     assert told == {"payload": 0.5, "push_x": -2.0}
+
+
+def test_the_neck_of_a_loop_is_its_plant_with_the_loops_own_values() -> None:
+    paper = NeckParameters.paper()
+    values = {name: getattr(paper, name) for name in NeckParameters.names()}
+    ports = [SimpleNamespace(name=name, start=value) for name, value in values.items()]
+    given: dict[str, Any] = {"unknown": 1.0, "pretension": 1.5 * paper.pretension, "noise_seed": 7.0}
+
+    def loop(robot: Robot, ports: list[Any], *, block: bool = True, **own: Any) -> Any:
+        plant = SimpleNamespace(block=SimpleNamespace(parameters=ports)) if block else SimpleNamespace(parameters=ports)
+        return SimpleNamespace(plant=plant, robot=robot, plant_parameters=own)
+
+    for block in (True, False):
+        assert _deploy.neck_of(loop(NECK, ports, block=block)) == paper
+        found = _deploy.neck_of(loop(NECK, ports, block=block, **given))
+        assert found == paper.replace(pretension=1.5 * paper.pretension)
+    assert _deploy.neck_of(loop(NECK, ports[:-1])) is _deploy.neck_of(loop(NECK, [])) is None
+    # Tendons of another robot stand where its file says, and are no parameters of its plant.
+    plain = [port for port in ports if not port.name.startswith("tendon_angle")]
+    assert _deploy.neck_of(loop(NECK, plain)) is None
+    assert _deploy.neck_of(loop(Robot.preset("trunk4"), plain)) == paper
+    assert [_deploy.noise_seed(loop(NECK, ports, **own)) for own in ({}, given)] == [0, 7]
 
 
 def test_each_fiftieth_sample_reports_what_is_done_and_each_goes_into_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
