@@ -324,6 +324,17 @@ def test_a_plain_table_may_be_as_large_as_it_is_read_fast(tmp_path: Path, monkey
     assert read_plain_csv(tmp_path / "none.csv") is None
 
 
+def test_a_plain_recording_is_read_without_pandas_and_any_other_by_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording, read = neck_recording(30), list[str]()
+    monkeypatch.setattr(_files, "read_table", lambda *args: read.append(args[1]) or read_table(*args))
+    for name in ("a.csv", "a.parquet"):
+        write_recording(tmp_path / name, recording)
+        assert same(read_recording(tmp_path / name), recording)
+    assert read == [".parquet"]
+
+
 def test_missing_samples_are_allowed_where_a_sensor_may_miss_one() -> None:
     values = pd.Series(["1", None, "NaN", "2"], dtype=object)
     plain = np.array([1.0, np.nan])
