@@ -1002,6 +1002,38 @@ def test_disturbances_of_a_loop_act_on_simulated_drives_and_set_points_are_the_c
     assert told == {"payload": 0.5, "push_x": -2.0}
 
 
+def test_a_virtual_cycle_samples_steps_sends_and_lets_time_pass_and_a_host_that_hangs_steps_nothing() -> None:
+    told: list[Any] = []
+    link: Any = SimpleNamespace(now=0.0, newest=None, sampling=True, drain=lambda: ["in"],
+                                send=lambda frames: told.append(("sent", frames)))  # fmt: skip
+
+    def sample(now: float) -> None:
+        assert link.sampling is False
+        link.newest = f"tilt at {now:g}"
+
+    link.neck = SimpleNamespace(sample=sample)
+    link.pass_time = lambda: setattr(link, "now", link.now + 1.0)
+    master: Any = SimpleNamespace(settings=SimpleNamespace(sample_cycles=3), sample_due=False)
+    master.step = lambda *args: told.append(args) or ["out"]
+    seen: list[Any] = []
+    run = VirtualRun(link, master, watch=lambda run: seen.append(run.cycles),
+                     watches=(lambda *args: seen.append(args[:4]),))  # fmt: skip
+    # Sampled in every third cycle; the master reads it where it is due, once.
+    for due, tilt in ((False, None), (True, "tilt at 0"), (True, None), (True, "tilt at 3")):
+        told.clear()
+        seen.clear()
+        at, cycles = link.now, run.cycles
+        master.sample_due = due
+        run.step()
+        assert told == [(at, ["in"], tilt), ("sent", ["out"])]
+        assert seen == [(at, ["in"], ["out"], tilt), cycles]
+        assert (link.now, run.cycles) == (at + 1.0, cycles + 1)
+    told.clear()
+    run.host_stopped = True
+    run.step()
+    assert (told, run.cycles) == ([("sent", ())], 5)
+
+
 def test_the_neck_of_a_loop_is_its_plant_with_the_loops_own_values() -> None:
     paper = NeckParameters.paper()
     values = {name: getattr(paper, name) for name in NeckParameters.names()}
