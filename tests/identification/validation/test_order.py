@@ -7,13 +7,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from softneck.core import DataError, Matrix, load
-from softneck.identification import Model, Rules, validate
+from softneck.identification import Model, Rules, Validation, validate
 from softneck.identification.models._scores import nrmse_fit, r_squared, rmse, worst_error
 from softneck.identification.validation import _baselines, _error_statistics, _score_tables
 from softneck.identification.validation._error_statistics import (
@@ -551,6 +551,22 @@ def test_without_a_simulation_there_is_none_and_a_row_with_one_output_is_a_row()
     whole = validate(rls(), run, horizons=(1, "inf"))
     assert "1 record(s)" in whole.calibrated_bounds["reason"]
     assert whole.cold_fits["pitch"] is not None
+
+
+def test_errors_of_outputs_in_another_unit_than_degrees_are_named_without_one() -> None:
+    entry = {"rmse_deg": 1, "r2": 2, "measured_range": 3, "per_run": [{"worst_deg": 4, "fits": 5}]}
+    plain = {"rmse": 1, "r2": 2, "measured_range": 3, "per_run": [{"worst": 4, "fits": 5}]}
+    cart = Robot.from_dict({
+        "name": "cart", "motors": {"names": ["p"], "unit": "kPa"}, "outputs": {"names": ["x"], "unit": "mm"},
+        "directions": {"kind": "matrix", "matrix": [[1.0]]},
+    })  # fmt: skip
+    for robot, told in ((Robot.preset("neck"), entry), (cart, {**plain, "unit": "mm"})):
+        assert Validation.as_dict(SimpleNamespace(robot=robot, _entry=lambda: entry)) == told  # pyright: ignore[reportArgumentType]
+    measured = np.array([[-0.002], [np.nan], [0.005]])
+    for y, told in ((measured, [-2.0, 5.0]), (measured * np.nan, None)):
+        view: Any = SimpleNamespace(robot=cart, measured=y)
+        found = cast("Any", Validation.measured_range).fget(view)
+        assert found == {"x": told if told is None else pytest.approx(told)}
 
 
 # -- baselines --------------------------------------------------------------------------------------------------------
