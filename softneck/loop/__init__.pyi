@@ -38,6 +38,7 @@ from ._references import same_quantity as same_quantity
 from ._result import SETTLING_BAND as SETTLING_BAND
 from ._result import error_unit as error_unit
 from ._result import metric_names as metric_names
+from ._result import shows_settling as shows_settling
 from ._run import LoopRows as LoopRows
 from ._run import StepCallback as StepCallback
 from ._run import row_actions as row_actions

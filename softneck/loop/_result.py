@@ -60,6 +60,8 @@ class LoopResult(ReprMixin):
 
 # Settling is to 5 % of the step, as in the lab's reports.
 SETTLING_BAND = 0.05
+# Largest deviation among some hundred samples of noise, in standard deviations.
+_NOISE_SIGMAS = 4.0
 # A tendon with less tension than this is slack [N]: 0.1 g, far below any pretension.
 _SLACK_TENSION_N = 1e-3
 # Rise time is from 10 to 90 % of the step.
@@ -70,6 +72,11 @@ _STEADY_SHARE = 0.25
 _AXIS_METRICS = ("rise_s", "settling_s", "overshoot_pct", "rms_error_deg", "iae", "ise", "itae", "steady_rms_deg")
 _MOTOR_METRICS = ("max_rad", "max_rate_rad_s", "effort", "total_variation_rad", "limit_violation_s", "slack_s")
 Metrics = dict[str, dict[str, float | None]]
+
+
+def shows_settling(noise: float, size: float) -> bool:
+    """Return whether a sensor's noise (standard deviation) stays within the settling band of a step of a size."""
+    return _NOISE_SIGMAS * noise <= SETTLING_BAND * size
 
 
 def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:

@@ -16,7 +16,7 @@ import numpy as np
 from softneck.core import SettingsError, to_si
 from softneck.design import ControllerLimits, LoopSettings, UncertainPlant, axis_test, least_rise, uncertain_plant
 from softneck.estimation import AxisPlant
-from softneck.loop import SETTLING_BAND, default_limits
+from softneck.loop import default_limits, shows_settling
 from softneck.loop.default_limits import required_rise
 from softneck.robot import TIME_CONSTANT, Robot
 from softneck.verification import (
@@ -35,8 +35,6 @@ from softneck.verification import (
 )
 
 _RISE_METRIC = "sim.rise_s"
-# Largest deviation among some hundred samples of noise, in standard deviations.
-_NOISE_SIGMAS = 4.0
 # How far a search stays within limits, beside its reserve, for draws that it does not see.
 _UNSEEN = {"axes.gain_margin": 0.2}
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
@@ -79,7 +77,7 @@ class TuneRequirements:
     def shows_settling(self, part: float = 1.0) -> bool:
         """Return whether the sensor noise stays within the settling band of a share of the step."""
         size = part * float(self.certificate.sim["size_deg"])
-        return _NOISE_SIGMAS * self.track["noise_deg"] <= SETTLING_BAND * size
+        return shows_settling(self.track["noise_deg"], size)
 
     def lines(self) -> list[str]:
         """Return each requirement as a line of text."""

@@ -20,7 +20,7 @@ import numpy as np
 from softneck.core import DataError, Progress, Vector, compute_once, worst
 from softneck.estimation import directions_of
 from softneck.identification import Draws, Model
-from softneck.loop import BlockPart, Loop, LoopResult, MotorFault, RobotReference, error_unit, run_loop
+from softneck.loop import BlockPart, Loop, LoopResult, MotorFault, RobotReference, error_unit, run_loop, shows_settling
 from softneck.runtime import Block
 
 from ._experiments import (
@@ -156,9 +156,10 @@ def run_drawn(
     """Run all loops over the draws of a family.
 
     Steps of every required direction at the lightest and the heaviest payload, with the disturbance of the draws, the
-    sensor's noise, and a load after the step; and each required margin at three amplitudes. Of the draws that swing
-    most there the margin itself is bisected. Attempt 0 takes the draws that a search may see. Equal loops are run once
-    in a process, as those of a controller that `tune` has verified.
+    sensor's noise (where it is too loud to show settling, in the loop alone), and a load after the step; and each
+    required margin at three amplitudes. Of the draws that swing most there the margin itself is bisected. Attempt 0
+    takes the draws that a search may see. Equal loops are run once in a process, as those of a controller that `tune`
+    has verified.
     """
     limits = [(b.metric, b.bound, b.limit) for b in asked.bounds if b.metric.startswith("sim.") or b.metric in _MARGINS]
 
@@ -276,6 +277,7 @@ def _step(task: _Task, plant: SimulationModel, number: int, kg: float, orientati
     parameters = {f"share_{axis}": float(s) for axis, s in zip(outputs, draws.share, strict=True)}
     # A recording that is noisier than what is asked is believed.
     noise = max(scale.si(float(asked.step["noise_deg"])), float(draws.noise.max()))
+    told = "seen" if shows_settling(noise, size) else "without_noise"
     parameters |= {"keep": draws.keep, "noise": noise, "noise_seed": float(number)}
     loop = Loop(
         plant=plant.quiet(task.controller.sample_time), controller=BlockPart(task.controller),
@@ -288,7 +290,7 @@ def _step(task: _Task, plant: SimulationModel, number: int, kg: float, orientati
     )  # fmt: skip
     name_of = scale.name_of
     try:
-        result = _with_disturbance(run_loop(loop, compiled=True))
+        result = _with_disturbance(run_loop(loop, compiled=True), told)
     except DataError:  # numbers overflowed
         result = None
     names = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "slack_s")
@@ -316,11 +318,11 @@ def _load(task: _Task, axis: int, start: float) -> Iterable[MotorFault]:
             yield MotorFault(kind="offset", start=start, motor=motor, size=float(size), robot=task.asked.robot)
 
 
-def _with_disturbance(result: LoopResult) -> LoopResult:
-    """Return a result whose outputs are what the sensor tells: those of the draw with disturbance and noise."""
+def _with_disturbance(result: LoopResult, told: str) -> LoopResult:
+    """Return a result whose outputs are those of the draw with disturbance: "seen" by the sensor or "without_noise"."""
     own = {}
     for name in result.robot.outputs.names:
-        seen = next(key for key in result.signals if key.endswith(f"{name}_measured_seen"))
+        seen = next(key for key in result.signals if key.endswith(f"{name}_measured_{told}"))
         own[name] = result.signals[seen]
     return replace(result, signals={**result.signals, **own})
 

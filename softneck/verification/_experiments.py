@@ -364,7 +364,7 @@ def scale_loop_gain(
         kind="louder", role="filter", runtime=_LOOP_GAIN_RUNTIME, sample_time=controller.sample_time,
         arrays=(np.array([float(outputs.index(name.removesuffix("_rate"))) for name in read]), np.array([float(kept)])),  # pyright: ignore[reportArgumentType]
         inputs=(*inputs, *references),
-        outputs=tuple(replace(port, name=f"{port.name}_seen") for port in inputs),
+        outputs=tuple(replace(p, name=f"{p.name}_{what}") for what in ("seen", "without_noise") for p in inputs),
         parameters=(
             *(Port(name=f"gain_{axis}", start=1.0, minimum=0.0) for axis in outputs),
             *(Port(name=f"delay_{axis}", minimum=0.0, maximum=kept - 2.0) for axis in outputs),

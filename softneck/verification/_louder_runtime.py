@@ -38,7 +38,8 @@ def step(p: LouderArrays, parameters: np.ndarray, x: LouderState, inputs: np.nda
     """Advance by one sample.
 
     inputs: what is measured, then the references. parameters: gain of each axis, then its delay [samples], then its
-    share of the disturbance; keep, standard deviation of the noise, seed.
+    share of the disturbance; keep, standard deviation of the noise, seed. outputs: what is passed on, then the same
+    without the noise.
     """
     axes = (parameters.shape[0] - 3) // 3
     keep, noise = parameters[3 * axes], parameters[3 * axes + 1]
@@ -59,6 +60,7 @@ def step(p: LouderArrays, parameters: np.ndarray, x: LouderState, inputs: np.nda
         late = held[whole]
         if part > 0.0:
             late += part * (held[whole + 1] - held[whole])
-        outputs[c] = inputs[p.n + c] + parameters[axis] * late + x.disturbance[c]
+        outputs[p.n + c] = inputs[p.n + c] + parameters[axis] * late + x.disturbance[c]
+        outputs[c] = outputs[p.n + c]
         if noise > 0.0:
             outputs[c] += noise * random_normal(x.random)

@@ -274,21 +274,33 @@ def test_the_error_under_the_load_is_the_worse_output_s_from_the_load_on() -> No
 
 def test_outputs_of_a_draw_are_those_that_its_sensor_tells() -> None:
     told = result_of(pitch=[0.0, 1.0, 2.0], roll=[0.0, 0.0, 0.0], pitch_measured_seen=[5.0, 6.0, 7.0],
-                     roll_measured_seen=[1.0, 2.0, 3.0])  # fmt: skip
-    found = _drawn._with_disturbance(told)
+                     roll_measured_seen=[1.0, 2.0, 3.0], pitch_measured_without_noise=[4.0, 4.0, 4.0],
+                     roll_measured_without_noise=[3.0, 3.0, 3.0])  # fmt: skip
+    found = _drawn._with_disturbance(told, "seen")
     assert (found["pitch"].tolist(), found["roll"].tolist()) == ([5.0, 6.0, 7.0], [1.0, 2.0, 3.0])
+    quiet = _drawn._with_disturbance(told, "without_noise")
+    assert (quiet["pitch"].tolist(), quiet["roll"].tolist()) == ([4.0] * 3, [3.0] * 3)
     rows = rows_of(found, 1, 3)
     assert (rows.time.tolist(), rows["roll"].tolist()) == ([TS, 2 * TS], [2.0, 3.0])
 
 
 @pytest.mark.parametrize("angle", [0.0, 90.0])
 @pytest.mark.parametrize("load", [0.0, -0.05])
-@pytest.mark.parametrize(("diverges", "sensed", "noise"), [(False, 0.1, 0.2), (True, 0.1, 0.2), (False, 0.3, 0.3)])
+@pytest.mark.parametrize(
+    ("diverges", "sensed", "noise", "told", "other"),
+    [
+        (False, 0.1, 0.12, "seen", "without_noise"),
+        (True, 0.1, 0.12, "seen", "without_noise"),
+        # Four deviations are more than 5 % of the step.
+        (False, 0.13, 0.13, "without_noise", "seen"),
+    ],
+)
 def test_a_step_of_a_draw_has_its_disturbance_and_then_its_load(
-    angle: float, load: float, diverges: bool, sensed: float, noise: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    angle: float, load: float, diverges: bool, sensed: float, noise: float, told: str, other: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     asked = make_requirements(
-        {"step": {"load_rad": load, "noise_deg": 0.2}, "sim": {"size_deg": 10.0, "duration_s": 2.5}}
+        {"step": {"load_rad": load, "noise_deg": 0.12}, "sim": {"size_deg": 10.0, "duration_s": 2.5}}
     )
     loops = []
 
@@ -301,13 +313,14 @@ def test_a_step_of_a_draw_has_its_disturbance_and_then_its_load(
         for name, size in zip(("pitch", "roll"), loop.reference.values, strict=True):
             signals[f"{name}_reference"] = np.where(np.arange(rows) * TS >= loop.reference.at, size, 0.0)
             signals[name] = np.full(rows, 9.0)
-            signals[f"louder.{name}_measured_seen"] = signals[f"{name}_reference"] + 0.01 * (np.arange(rows) >= 150)
+            signals[f"louder.{name}_measured_{told}"] = signals[f"{name}_reference"] + 0.01 * (np.arange(rows) >= 150)
+            signals[f"louder.{name}_measured_{other}"] = np.full(rows, 8.0)
         return LoopResult(np.arange(rows) * TS, signals, {}, TS)
 
     monkeypatch.setattr(_drawn, "run_loop", run)
     monkeypatch.setattr(_drawn, "Loop", lambda **settings: SimpleNamespace(**settings))
     motors = np.array([[1.0, 0.0], [0.5, -1.0], [0.0, 2.0]])
-    # The worse sensor's noise, if more than the 0.2 deg asked.
+    # The worse sensor's noise, if more than the 0.12 deg asked.
     draws = told_draws()
     draws.noise = np.radians([0.01, sensed])
     task: Any = SimpleNamespace(

@@ -253,6 +253,8 @@ def test_each_channel_is_late_louder_and_disturbed_by_its_own_numbers() -> None:
             late = np.interp(len(past) - 1 - delays[i], np.arange(len(past)), past)
             # Rounding of three operations on numbers of size one.
             assert seen[i] == pytest.approx(r[k, i] + gains[i] * late, abs=1e-14)
+            # Without noise both are the same.
+            assert seen[2 + i] == seen[i]
     # The disturbance alone: without motion nothing, and it fades by `keep`.
     part.start(0.0, {"gain_pitch": 0.0, "gain_roll": 0.0, "share_pitch": 0.3, "keep": 0.9, "noise_seed": 1.0})
     still = [0.2, 0.0, 0.0, 0.0]
@@ -261,6 +263,12 @@ def test_each_channel_is_late_louder_and_disturbed_by_its_own_numbers() -> None:
     for before, after in pairwise(moved):
         assert after[0] == pytest.approx(0.9 * before[0], rel=1e-12)
         assert after[1] == 0.0
+    # Noise is told apart, and returns to no error.
+    part.start(0.0, {"noise": 0.5, "noise_seed": 2.0})
+    seen = np.array([part.step(k * TS, np.array([0.2, -0.1, 0.0, 0.0])).copy() for k in range(400)])
+    np.testing.assert_array_equal(seen[:, 2:], np.tile([0.2, -0.1], (400, 1)))
+    # A deviation of 800 numbers is 5 % off at most in two of its own deviations.
+    assert np.std(seen[:, :2] - seen[:, 2:]) == pytest.approx(0.5, rel=0.05)
 
 
 def test_at_rest_on_its_reference_a_loop_does_not_notice_its_gain() -> None:
@@ -275,7 +283,7 @@ def test_at_rest_on_its_reference_a_loop_does_not_notice_its_gain() -> None:
     part = BlockPart(block)
     part.start(0.0, {"gain_pitch": 1.7, "gain_roll": 0.4})
     seen = part.step(0.0, np.array([at_rest[port.name] for port in block.inputs]))
-    np.testing.assert_array_equal(seen, [0.3, -0.2, 0.0, 0.0])
+    np.testing.assert_array_equal(seen, 2 * [0.3, -0.2, 0.0, 0.0])
 
 
 def test_an_experiment_leads_to_its_posture_waits_and_kicks() -> None:

@@ -199,11 +199,12 @@ def make_draws(
     """Return draws of a robot from its recordings.
 
     Models are fitted to the first three quarters of each run: for robots that tendons bend the grey box without and
-    with its optional parts, else kind `play`. The model is the one that predicts the last quarters best, by the
+    with its optional parts, else kind `play`. What the nearest draw leaves over of the last quarters, less the sensor's
+    noise, is a disturbance. The model is the one that, with disturbance and noise, predicts them best, by the
     continuous ranked probability score (Gneiting and Raftery 2007, J. Am. Stat. Assoc. 102:359); the factor on the
     deviations of its numbers is the smallest within one standard error of the best (Breiman et al. 1984, sec. 3.4).
-    What the nearest draw leaves over there, less the sensor's noise, is the disturbance; it is raised until the band
-    covers `LEVEL` of the samples at every amplitude. Simulations begin 20 s of a neck's time before the last quarters.
+    Then the disturbance is raised until the band covers `LEVEL` of the samples at every amplitude. Simulations begin
+    20 s of a neck's time before the last quarters.
 
     Args:
         recordings: of one robot and sample time, the payload as a channel.
@@ -222,18 +223,19 @@ def make_draws(
     train, held, warm_ups = _split(whole, second)
     sources = _sources(train, lambda done, text: progress(0.7 * done, f"draws: {text}"))
     motions = _Motions.of(held, sources[0].model, second, warm_ups)
-    tried: list[tuple[Vector, Source, float, np.ndarray]] = []
+    memory, tried = second / held.sample_time, list[tuple[Vector, Source, float, np.ndarray]]()
     for number, (source, factor) in enumerate(product(sources, _FACTORS)):
         progress(0.7 + 0.15 * number / (len(sources) * len(_FACTORS)), f"draws: deviations times {factor:g}")
         rng = np.random.default_rng([seed, 0])
         trial = [source.draw(rng) for _ in range(_CALIBRATION_DRAWS)]
         Y = replace(motions, model=source.model).simulate([source.arrays(draw, factor) for draw in trial])
-        tried.append((motions.scores(Y), source, factor, Y))
+        loops = motions.disturbed(Y, *motions.disturbance(Y, memory), np.random.default_rng([seed, 2]))
+        tried.append((motions.scores(loops), source, factor, Y))
     best, winner = min(((scores, source) for scores, source, _, _ in tried), key=lambda item: float(item[0].mean()))
     if not math.isfinite(float(best.mean())):
         raise DataError("no draw has a finite simulation on the held-out motions; record longer.")
     _, source, factor, Y = next(item for item in tried if item[1] is winner and _no_worse(item[0], best))
-    share, keep = motions.disturbance(Y, second / held.sample_time)
+    share, keep = motions.disturbance(Y, memory)
     more = next((more for more in _MORE if motions.covers(Y, more * share, keep)), _MORE[-1])
     rows = []
     rng = np.random.default_rng([seed, 1])
@@ -342,12 +344,16 @@ class _Motions:
         return np.array(found)
 
     def scores(self, Y: np.ndarray) -> Vector:
-        """Return the continuous ranked probability score of the draws in each segment, relative to its motion."""
+        """Return the continuous ranked probability score of the draws in each segment, relative to its motion.
+
+        It is unbiased for any number of draws (Ferro 2014, Q. J. R. Meteorol. Soc. 140:1917).
+        """
         weight = 1.0 / np.maximum(self.motion, 0.05 * self.motion.max())[self.groups][:, None]
-        half = len(Y) // 2
+        n = len(Y)
+        ranks = 2.0 * np.arange(n) + 1.0 - n  # of sorted draws: their sum is that of all distances between two
         with np.errstate(all="ignore"):
-            away, apart = np.abs(Y - self.outputs), np.abs(Y[:half] - Y[half : 2 * half])
-            each = (away.mean(axis=0) - 0.5 * apart.mean(axis=0)) * weight
+            apart = np.tensordot(ranks, np.sort(Y, axis=0), 1) / (n * (n - 1))
+            each = (np.abs(Y - self.outputs).mean(axis=0) - apart) * weight
         found = np.array([each[self.groups == k].mean() for k in range(len(self.motion))])
         return np.where(np.isfinite(found), found, math.inf)
 
@@ -375,6 +381,15 @@ class _Motions:
             tried.append((cost, np.sqrt(square), keep))
         _, share, keep = min(tried, key=lambda item: item[0])
         return share, keep
+
+    def disturbed(self, Y: np.ndarray, share: Vector, keep: float, rng: np.random.Generator) -> np.ndarray:
+        """Return simulations (draws, rows, outputs) with their disturbance and the sensor's noise, as in loops."""
+        from scipy.signal import lfilter
+
+        moves = share * np.diff(Y, axis=1, prepend=Y[:, :1]) * rng.standard_normal(Y.shape)
+        with np.errstate(all="ignore"):
+            away = np.asarray(lfilter([1.0], [1.0, -keep], moves, axis=1))
+        return Y + away + self.noise * rng.standard_normal(Y.shape)
 
     def _nearest(self, Y: np.ndarray) -> np.ndarray:
         """Return the number (rows,) of the draw with the least squared error in the segment of each row."""

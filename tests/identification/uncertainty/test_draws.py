@@ -600,3 +600,24 @@ def test_a_disturbance_goes_by_the_motion_of_the_middle_draw_and_the_first_certi
     np.testing.assert_allclose(high - Y.max(axis=0), expected)
     np.testing.assert_allclose(Y.min(axis=0) - low, expected)
     assert bits(made().for_certificate()) == bits(made().for_certificate(1))
+
+
+def test_draws_are_scored_with_the_disturbance_and_the_noise_that_loops_add() -> None:
+    """Noise of the sensor alone widens no deviations: narrow draws and the noise are the sharpest that explain it."""
+    rng = np.random.default_rng(7)
+    groups, wave = np.repeat(np.arange(8), 250), np.sin(0.02 * np.arange(2000))[:, None]
+    nothing: Any = SimpleNamespace()
+    motions = _draws._Motions(
+        nothing, nothing, wave + 0.1 * rng.standard_normal((2000, 1)), groups, np.ones(8), np.zeros(8, dtype=int),
+        np.array([0.1]),
+    )  # fmt: skip
+    narrow, wide = (wave + size * rng.standard_normal((40, 1, 1)) for size in (0.001, 0.1))
+    told = [motions.disturbed(Y, np.zeros(1), 0.5, np.random.default_rng(0)) for Y in (narrow, wide)]
+    assert (motions.scores(told[0]) < motions.scores(told[1])).all()
+    assert motions.scores(narrow).mean() > motions.scores(wide).mean()  # as it was without
+    # Their variance is that of the band: of the moves that the draw has made so far, and of the noise.
+    share, many = np.array([0.3]), np.repeat(wave[None, :200], 4000, axis=0)
+    away = (motions.disturbed(many, share, 0.9, np.random.default_rng(1)) - many).var(axis=0)
+    expected = share**2 * _draws._filtered(np.diff(wave[:200], axis=0, prepend=wave[:1]), 0.9) + 0.1**2
+    # A variance of 4,000 numbers deviates by 2.2 %; the largest of 200 by four of its deviations at most.
+    np.testing.assert_allclose(away, expected, rtol=0.09)
