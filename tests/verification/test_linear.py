@@ -301,7 +301,8 @@ def test_measured_outputs_have_noise_of_the_stated_size_and_none_at_zero() -> No
     part = BlockPart(linear_plant(**values, sample_time=TS))
     for std in (0.0, 0.01):
         for seed in (0.0, 5.0):
-            part.start(0.0, {"noise_std": std, "noise_seed": seed})
+            first = part.start(0.0, {"noise_std": std, "noise_seed": seed})
+            assert (first[:4] != 0.0).tolist() == [False, False, std > 0.0, std > 0.0]
             rows = np.array([part.step(k * TS, np.zeros(5)).copy() for k in range(2000)])
             assert not rows[:, :2].any()
             for axis in (2, 3):
