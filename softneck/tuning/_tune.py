@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
@@ -493,10 +494,8 @@ def _observer(task: Task) -> Any:
     """Return the Kalman filter over a model with payloads, else over the nominal plant, or None."""
     several = [model for model in task.models if payloads(model.arrays) is not None]
     for model in (*several, next(iter(task.linear.values()))):
-        try:
+        with contextlib.suppress(SettingsError):
             return KalmanSettings().design(model)
-        except SettingsError:
-            continue
     return None
 
 

@@ -322,6 +322,9 @@ def test_curves_have_set_points_and_their_common_part_in_the_motors_unit() -> No
     }  # fmt: skip
     alone: Any = SimpleNamespace(weights=LEARNED)
     assert _judge._step_curves(task, alone, y, P).keys() == found.keys()
+    # Two of four that pull against each other are enough: their part of the mean.
+    pair: Any = SimpleNamespace(weights=np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]))
+    assert _judge._step_curves(task, pair, y, P)["tautness"] == pytest.approx([0.5, 0.375])
 
 
 # -- candidates -------------------------------------------------------------------------------------------------------
@@ -1526,7 +1529,11 @@ def relaxed(monkeypatch: pytest.MonkeyPatch, items: list[Candidate], held: dict[
     # That of the best may hold where the loops of its search do not.
     first = SimpleNamespace(failed=[items[0].kind], holds=True)
     found: Any = _Found(task, items[0], first, candidates=tuple(items), controller=controller)
-    again: Any = _tune._relax(found, tried, None, lambda *_: None)
+    done: list[float] = []
+    again: Any = _tune._relax(found, tried, None, lambda share, _: done.append(share))
+    # Of the last tenth of the bar of `tune`.
+    assert done == sorted(done)
+    assert all(0.0 <= share <= 1.0 for share in done)
     assert again.holds is any(held.get((kind, wide)) for kind, wide, _ in made)
     if not again.holds:
         assert again is found
