@@ -74,8 +74,10 @@ def models() -> dict[str, Model]:
 
 
 @pytest.fixture
-def plain_steps_of_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a test of few samples run plain Python: compiling what no other test runs takes seconds."""
+def plain_steps_of_blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a fast test run plain Python: compiling takes seconds a kind, and only slow tests need its speed."""
+    if request.node.get_closest_marker("slow"):
+        return
     for name in ("_runtime", "_tangent"):
         made = getattr(_compile, name)
         monkeypatch.setattr(_compile, name, lambda module, _compiled, made=made: made(module, False))

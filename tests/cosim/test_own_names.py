@@ -20,6 +20,8 @@ from softneck.runtime import Block, Port
 from softneck.signals import Recording, read_recording, write_recording
 from tests.design.test_robots import plant
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 FINGER = Robot.from_dict({
     "name": "finger", "sample_time_s": 0.02,
     "motors": {"names": ["pressure"], "unit": "kPa", "setpoint_min": 0.0, "setpoint_max": 150.0, "rate_limit": 2000.0},

@@ -15,6 +15,8 @@ from softneck.cosim import load_loop, simulate
 from softneck.fmu import unpacked
 from softneck.plant import NeckParameters, VirtualNeck
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 LOOP = """
 duration_s = 2.0
 [plant]

@@ -19,6 +19,8 @@ from softneck.runtime import Port
 
 from ..design.test_robots import plant
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 SSD = "{http://ssp-standard.org/SSP1/SystemStructureDescription}"
 SSC = "{http://ssp-standard.org/SSP1/SystemStructureCommon}"
 

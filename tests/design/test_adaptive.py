@@ -29,6 +29,8 @@ from softneck.signals import redefine
 
 from .test_pi import POLE, TS, B, DelayedNeck, neck
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 DEG = math.radians(1.0)
 NOMINAL = B / (1.0 - POLE)
 LEARNT = ("theta", "U", "D", "tally")

@@ -29,6 +29,8 @@ from softneck.estimation import LinearNeck
 
 from .test_coupled_plants import within
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 TS = 0.02
 ROBOT = within(3, 2)
 # The paper's own (Eq. 31), without its dead time.

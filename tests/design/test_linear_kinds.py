@@ -13,6 +13,8 @@ from softneck.identification import Model, OutputError, Rls
 from ..data import neck_recording, slow_but
 from ..oracles.bake_off import exact
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 KINDS = {
     "rls": Rls(max_delay=0.12),
     "miso": Rls(structure="miso", nb=2, max_delay=0.12),

@@ -26,6 +26,8 @@ from softneck.signals import Recording, signal
 
 from ..data import ROOT
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 TS = 0.02
 # A length that two chambers move; nobody told their directions, and it is 50 mm at one bar.
 PUSHER = Robot.from_dict({

@@ -16,6 +16,8 @@ from softneck.signals import Recording, concatenate
 
 from .necks import IN_TIME, neck, recording
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 
 def test_levels_that_trust_any_measurement_bridge_a_gap_worse_than_the_true_ones() -> None:
     data, observer = recording(noise_deg=0.2), IN_TIME.design(neck())

@@ -24,6 +24,8 @@ from softneck.estimation._observer import (
 
 from .necks import IN_TIME, TS, neck, recording, smooth_motion
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 
 def observer_of(settings: KalmanSettings = IN_TIME, *, pitch_delay: int = 4, roll_delay: int = 2) -> KalmanObserver:
     return settings.design(neck(pitch_delay=pitch_delay, roll_delay=roll_delay))

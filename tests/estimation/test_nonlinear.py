@@ -26,6 +26,8 @@ from ..foreign_necks.necks import ForeignNeck
 from ..foreign_necks.spoiled import errors_deg, filtered, logged, motions, moved, spoiled
 from .necks import changed, jumping, neck, ramped, with_levels
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 # In time, and a disturbance whose walk does not depend on the motion.
 WALK, NOISE = math.radians(0.3), math.radians(0.05)
 PLAIN = KalmanSettings(sensor_delay=0.0, measurement_noise_std=NOISE)
@@ -284,7 +286,6 @@ def test_it_is_an_observer_of_a_loop(play: Model, training: Recording) -> None:
     assert np.isfinite(result["pitch_estimate"]).all()
 
 
-@pytest.mark.usefixtures("plain_steps_of_blocks")
 def test_another_robot_gives_its_sensor_and_units() -> None:
     robot = Robot.preset("antagonist")
     log = record(signal("eq22", duration=20.0, robot=robot), VirtualNeck(NeckParameters.preset("paper"), robot), seed=1)

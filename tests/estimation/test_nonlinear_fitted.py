@@ -21,6 +21,8 @@ from softneck.signals import Recording, concatenate, signal
 
 from .necks import without
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 TRUE = (math.radians(0.25), math.radians(0.2), 0.8)
 
 
@@ -75,12 +77,13 @@ def test_levels_that_are_true_are_found(observer: NonlinearObserver, walking: Re
 
 
 def test_what_was_fitted_is_kept_only_where_it_is_better(observer: NonlinearObserver, walking: Recording) -> None:
-    found = fit_levels_and_delays(observer, [walking])
+    run = next(iter(walking.runs()))
+    found = fit_levels_and_delays(observer, [run])
     assert found.checks[found.kept] == min(found.checks.values())
     assert set(found.checks) == {"default", "noise"}
     assert "sensor_delay" in found.not_identifiable
     right = observer.with_noise(TRUE)
-    again = fit_levels_and_delays(right, [walking])
+    again = fit_levels_and_delays(right, [run])
     assert again.checks[again.kept] <= again.checks["default"]
 
 

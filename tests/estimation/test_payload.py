@@ -26,6 +26,8 @@ from ..foreign_necks.necks import ForeignNeck
 from ..foreign_necks.necks import record as record_foreign
 from .necks import jumping, ramped, without
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 NOISE, REST, RATIO, START = math.radians(0.05), math.radians(0.1), 0.6, math.radians(40.0)
 STEP = 0.02
 # All is taken in, and the estimate is of the measurement's instant.
@@ -33,7 +35,8 @@ PLAIN = KalmanSettings(sensor_delay=0.0)
 
 
 def log(payload: float, rows: int = 800, seed: int = 1) -> Recording:
-    found = record(signal("eq22"), VirtualNeck(NeckParameters.paper()), seed=seed, payload=payload).rows(0, rows)
+    played = signal("eq22", duration=rows * 0.02)
+    found = record(played, VirtualNeck(NeckParameters.paper()), seed=seed, payload=payload)
     return found.with_channels(payload=np.full(rows, payload))
 
 

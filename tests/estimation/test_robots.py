@@ -23,6 +23,8 @@ from tests.design.test_robots import BELLOWS, TS, plant
 from .by_filterpy import by_filterpy
 from .necks import with_levels
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 # 5 mm of 20 mm of noise would drown it; 0.1 mm is what a string potentiometer has.
 SENSED = Robot.from_dict({**BELLOWS.as_dict(), "sensor": {"noise_std": 0.1, "delay_s": 0.05, "rate_hz": 50.0}})
 ROBOTS = {1: Robot.preset("antagonist"), 2: Robot.preset("trunk4"), 3: SENSED}

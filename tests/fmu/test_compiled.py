@@ -40,11 +40,12 @@ def _state(fmu: Any) -> bytes:
 
 # Compiling these takes minutes in all; the runtimes of controllers and observers are compared without drives, too.
 LONG = [
-    "nonlinear", "nonlinear_payload", "guarded", "mpc", "nmpc", "adaptive", "hinf", "pid", "fopi", "lqg", "custom",
+    *SHORT[1:], "nonlinear", "nonlinear_payload", "guarded", "mpc", "nmpc", "adaptive", "hinf", "pid", "fopi", "lqg",
+    "custom",
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", slow_but(KINDS, [*SHORT, "nn"], nightly=LONG))
+@pytest.mark.parametrize("kind", slow_but(KINDS, ["rls", "nn"], nightly=LONG))
 def test_compiled_and_plain_steps_agree(
     kind: str, tmp_path: Path, running: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -218,7 +218,7 @@ def test_a_kind_that_is_not_in_the_library_is_named(tmp_path: Path) -> None:
 def test_a_kind_that_the_translator_refused_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from softneck.fmu.compiled import _build
 
-    library = _library.find_library()
+    library = _library.find_library({"softneck.fmu.describe._tunable_plant_runtime"})
     refused = {"softneck.fmu.describe._tunable_plant_runtime": "`step`: `np.linalg.solve(A, b)`: no translation to C."}
     changed = dataclasses.replace(library, sources=dataclasses.replace(library.sources, refused=refused))
     monkeypatch.setattr(_build, "find_library", lambda _: changed)
@@ -229,7 +229,7 @@ def test_a_kind_that_the_translator_refused_says_why(tmp_path: Path, monkeypatch
 def test_platforms_that_are_unknown_or_not_built_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from softneck.fmu.compiled import _build
 
-    library = _library.find_library()
+    library = _library.find_library({"softneck.fmu.describe._tunable_plant_runtime"})
     only = dataclasses.replace(library, binaries={"aarch64-linux": b"not run here"})
     monkeypatch.setattr(_build, "find_library", lambda _: only)
     with pytest.raises(SettingsError, match="unknown platform `amiga`"):

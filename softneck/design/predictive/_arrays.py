@@ -174,7 +174,8 @@ def _to_own(arrays: tuple[Matrix, ...], robot: Robot) -> Matrix | None:
 
 def system(arrays: tuple[Matrix, ...]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     """Return A, B, C, D of `lti` in scaled quantities."""
-    arrays = remove_limits(arrays)
+    # In the layout that blocks have: numba compiles the step again for another one.
+    arrays = tuple(map(np.ascontiguousarray, remove_limits(arrays)))
     step = load_runtime(runtime_of(arrays)).step
     a = rt.MpcArrays(arrays)
     m, motors = a.T.shape[0] - 1, a.T.shape[1]

@@ -162,7 +162,7 @@ class FitProblem:
                 loaded_neck(numbers, load, payload) if load.size else numbers,
                 body,
                 self.sample_time,
-                self.drive[:, 1],
+                np.ascontiguousarray(self.drive[:, 1]),
                 0,
                 settle,
                 u,

@@ -66,11 +66,13 @@ def is_of_another_robot(path: str | Path) -> bool:
         draft = Draft(table)
         with np.errstate(all="ignore"):
             by_names(draft)
-        roles = find_roles(table, {})
         motors = any(draft.has(names) for names in (SET_POINTS, MOTOR_POSITIONS, MOTOR_VELOCITIES))
         angles = draft.quaternion is not None or any(name in draft.picks for name in _OF_A_NECK)
+        if motors and angles:
+            return False
+        roles = find_roles(table, {})
         # Three motors are a neck's, unless titles name other outputs than angles.
-        if motors and (angles or not any(names_a_place(table, column) for column in roles.outputs)):
+        if motors and not any(names_a_place(table, column) for column in roles.outputs):
             return False
         return bool(guess_robot(path, sample_time=1.0 if roles.time is None else None))
     except SoftneckError:
