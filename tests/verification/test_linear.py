@@ -9,6 +9,7 @@ from typing import Any
 import control
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from softneck.core import SettingsError
 from softneck.design import FopiSettings, PiSettings, mu_upper
@@ -128,6 +129,24 @@ def test_python_control_says_the_same_margins(kind: Any) -> None:
     # The grid of `W` is 3 % wide; straight lines on it.
     assert gain == pytest.approx(own["pitch.gain_margin"][0], rel=5e-3)
     assert phase == pytest.approx(own["pitch.phase_margin_deg"][0], rel=5e-3)
+
+
+@pytest.mark.parametrize("count", [3, 500], ids=["solved at each frequency", "by back substitution"])
+def test_the_response_of_a_law_is_that_of_its_parts(count: int) -> None:
+    # An integrator twice, a delay of three samples and a pair of poles: no basis of eigenvectors.
+    line, pair = np.eye(3, k=-1), 0.95 * np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]])
+    A: Any = block_diag([[1.0, TS], [0.0, 1.0]], line, pair)
+    B = np.array([[0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]]).T
+    C = np.array([[1.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0]])
+    D = np.array([[0.5, 0.0], [0.25, -1.0]])
+    w = np.geomspace(0.1, math.pi / TS, count)
+    z = np.exp(1j * TS * w)
+    angle = 0.95 * np.sin(0.3) / ((z - 0.95 * np.cos(0.3)) ** 2 + (0.95 * np.sin(0.3)) ** 2)
+    one = np.stack([TS / (z - 1.0) ** 2 + 2.0 * z**-3.0 + 0.5, z**-2.0 + 0.25], axis=-1)
+    two = np.stack([0.0 * z, angle - 1.0], axis=-1)
+    law = LinearLaw(A, B, B, C, D, D, TS)
+    # Rounding, beside two poles at the same place.
+    np.testing.assert_allclose(law.feedback(w), np.stack([one, two], axis=-1), rtol=1e-9, atol=1e-12)
 
 
 def test_two_complex_scalars_have_a_closed_form() -> None:
