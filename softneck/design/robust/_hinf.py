@@ -331,17 +331,22 @@ def _undo_scaling(
 
 def _riccati(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix) -> Matrix | None:
     """Return the stabilising X >= 0 of A'X + XA + Q - (XB + S) R^-1 (B'X + S') = 0, R of any sign; None if none is."""
-    from scipy.linalg import schur, solve
+    # LAPACK without the checks of scipy's `solve` and `schur`, which took longer: the same numbers.
+    from scipy.linalg.lapack import dgees, dsytrf, dsytrs  # pyright: ignore[reportAttributeAccessIssue]
 
     n = A.shape[0]
-    RB, RS = np.hsplit(solve(R, np.hstack([B.T, S.T]), assume_a="sym"), [n])
-    H = np.block([[A - B @ RS, -B @ RB], [-Q + S @ RS, -(A - B @ RS).T]])
-    ordered: Any = schur(H, output="real", sort="lhp")
-    T, U, stable = ordered
+    factor, pivots, singular = dsytrf(R)
+    if singular:
+        return None
+    solved = dsytrs(factor, pivots, np.hstack([B.T, S.T]))[0]
+    RB, RS = solved[:, :n], solved[:, n:]
+    loop = A - B @ RS
+    H = np.vstack([np.hstack([loop, -B @ RB]), np.hstack([-Q + S @ RS, -loop.T])])
+    T, stable, _, _, U, _, failed = dgees(lambda x, _: x < 0.0, H, sort_t=1)
     # Real parts are on the diagonal, imaginary parts of a pair the root of -T[k, k+1] T[k+1, k].
     real = np.abs(np.diag(T))
     largest = float(real.max(initial=0.0)) + math.sqrt(float(-(np.diag(T, 1) * np.diag(T, -1)).min(initial=0.0)))
-    if stable != n or real.min(initial=np.inf) <= _ON_AXIS * max(1.0, largest):
+    if failed or stable != n or real.min(initial=np.inf) <= _ON_AXIS * max(1.0, largest):
         return None
     try:
         X = np.linalg.solve(U[:n, :n].T, U[n:, :n].T).T
