@@ -36,6 +36,7 @@ library = packaged_library()
 needs_all = pytest.mark.skipif(library is None, reason="the libraries of these sources are not built: make native")
 
 
+@pytest.mark.usefixtures("plain_steps_of_blocks")
 @pytest.mark.parametrize("kind", NATIVE)
 def test_a_part_of_the_library_holds_each_kind(kind: str) -> None:
     block = exported_block(block_of(kind))
