@@ -14,8 +14,7 @@ from softneck.core import DataError, FileFormatError, error_reason, require_numb
 if TYPE_CHECKING:
     import pandas as pd
 
-# First line of a `.lvm` file, and the mark that ends its header and that of each segment.
-LABVIEW_MARK = "LabVIEW Measurement"
+# Ends the header of a `.lvm` file and that of each segment.
 _END_OF_HEADER = "***End_of_Header***"
 # A list in a cell with more items is no set of signals.
 _MAX_ITEMS = 64
