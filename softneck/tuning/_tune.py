@@ -28,6 +28,7 @@ from softneck.cosim import open_workers, pareto_rows
 from softneck.estimation import KalmanSettings, directions_of, robot_of
 from softneck.identification import payloads
 from softneck.robot import Robot, Scaling, load_for_robot
+from softneck.runtime import Block
 from softneck.signals import require_same_robot
 from softneck.verification import (
     LARGE,
@@ -314,10 +315,12 @@ def _failed_in_search(task: Task, item: Candidate) -> list[Verdict]:
     return [] if _is_near(item, failed, task) else failed
 
 
-def _drawn_in_search(task: Task, item: Candidate) -> list[Drawn]:
+def _drawn_in_search(task: Task, item: Candidate, observer: Block | None = None) -> list[Drawn]:
+    """Return the loops over the draws of the search, with this observer or that of the kind."""
     controller = design_candidate(task, prepare(task), item.kind, item.settings)
     order = str(getattr(controller, "order", "sequential"))
-    return search_draws(task, controller.block(), order, make_observer(task, item.kind))
+    eyes = make_observer(task, item.kind) if observer is None else observer
+    return search_draws(task, controller.block(), order, eyes)
 
 
 def _more_kept(kept: Mapping[str, float], failed: Sequence[Verdict]) -> dict[str, float]:
@@ -433,11 +436,13 @@ def _assumed(controller: Any) -> dict[str, float]:
 
 
 def _observed(task: Task, item: Candidate) -> bool:
-    """Return whether the steps meet their requirements with the observer of the task."""
+    """Return whether steps, and all that the draws of the search tell, keep their requirements with the observer."""
     eyes = task.observer
-    return make_observer(task, item.kind) is not None or (
-        eyes is not None and bool(task.own) and holds_with_observer(task, item, eyes, task.bounds)
-    )
+    if make_observer(task, item.kind) is not None:
+        return True
+    if eyes is None or not task.own or not holds_with_observer(task, item, eyes, task.bounds):
+        return False
+    return not any(part.failed for part in _drawn_in_search(task, item, eyes.block()))
 
 
 @dataclass(frozen=True, slots=True)

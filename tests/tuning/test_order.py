@@ -1444,9 +1444,11 @@ def test_loops_are_compared_with_loops_and_an_observer_is_judged_where_there_are
     assert _tune._compared(search) == levels
     monkeypatch.setattr(_tune, "make_observer", lambda _, kind: "eyes" if kind == "mpc" else None)
     monkeypatch.setattr(_tune, "holds_with_observer", lambda *_: True)
+    monkeypatch.setattr(_tune, "_drawn_in_search", lambda *_: [])
+    own_eyes: Any = SimpleNamespace(block=lambda: "seen")
     for own, eyes, kind, observed in (
-        ({}, "eyes", "pi", False), ({"p": 1}, "eyes", "pi", True), ({"p": 1}, None, "pi", False),
-        ({}, "eyes", "mpc", True),
+        ({}, own_eyes, "pi", False), ({"p": 1}, own_eyes, "pi", True), ({"p": 1}, None, "pi", False),
+        ({}, own_eyes, "mpc", True),
     ):  # fmt: skip
         task = task_for({}, own=own, observer=eyes, bounds=())
         assert _tune._observed(task, of_kind(kind, 0.5)) is observed
