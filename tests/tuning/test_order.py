@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 from collections.abc import Mapping
@@ -14,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from softneck.cli._tune import command as tune_command
 from softneck.core import KINDS, CheckFailedError, DataError, SettingsError, metric_of, resolve
 from softneck.loop import LoopResult, RobotReference
 from softneck.robot import Robot
@@ -1502,6 +1504,18 @@ def test_the_cocontraction_of_loops_is_the_recordings_with_the_heaviest_load(
     thing = SimpleNamespace(findings={"tested": {"conditions": parts}}, robot=Robot.preset())
     found = _tune._recorded_cocontraction({"f": thing}, Robot.preset())
     assert found == (None if held is None else pytest.approx(held))
+
+
+def test_a_search_without_candidates_has_nothing_in_its_way_and_its_defaults_are_those_of_the_command() -> None:
+    assert _tune.active_requirement([], [_bound("sim.rise_s")], tested=False) == (None, None)
+    defaults = {name: item.default for name, item in inspect.signature(_tune.tune).parameters.items()}
+    del defaults["plants"]
+    assert defaults == {
+        "requirements": None, "kinds": (), "budget": 160, "observer": None, "seed": 0, "workers": None, "folder": None,
+        "force": False, "files": None, "progress": None,
+    }  # fmt: skip
+    options = {option.name: option.default for option in tune_command.params}
+    assert (options["budget"], options["seed"]) == (160, 0)
 
 
 RELAXED = {"sim.rise_s": _tune.Loosened(0.5, 0.6, 0.7)}
