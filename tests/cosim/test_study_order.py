@@ -573,3 +573,21 @@ def test_a_loop_that_is_none_and_a_file_that_is_not_there_are_refused(loop: Any,
         _study._from_table(tmp_path / "study.toml", {"runs": 2})
     with pytest.raises(SettingsError, match="`vary` must be a table"):
         _study._from_table(tmp_path / "study.toml", {"loop": "a", "vary": 3})
+
+
+def test_a_library_that_the_system_holds_fails_no_study_at_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows deletes no file of a loaded FMU."""
+    made: list[dict[str, Any]] = []
+
+    class Folder(_run_study.tempfile.TemporaryDirectory):
+        def __init__(self, **how: Any) -> None:
+            made.append(how)
+            super().__init__(**how)
+
+    ended: list[bool] = []
+    pool = SimpleNamespace(shutdown=lambda *, wait, kill_workers: ended.append(wait and not kill_workers))
+    monkeypatch.setattr(_run_study.tempfile, "TemporaryDirectory", Folder)
+    monkeypatch.setattr(_run_study, "_processes", lambda *_: pool)
+    with _run_study.open_workers(2, None) as workers:
+        assert (workers.size, workers.pool) == (2, pool)
+    assert (ended, [how["ignore_cleanup_errors"] for how in made]) == ([True], [True])
