@@ -15,6 +15,8 @@ from softneck.signals import Recording, import_log, read_layout
 from ..data import LAYOUTS
 from .necks import with_levels
 
+pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")
+
 
 def read(shared_data: Path, payload: str) -> Recording:
     path = shared_data / f"neck_closedloop/frontier_test_{payload}gr.csv"
