@@ -7,6 +7,7 @@ what of the former is fmpy's own: a `doStep` over no time, in which the FMU has 
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 from fmpy.fmi2 import FMU2Slave
 from pytest_benchmark.fixture import BenchmarkFixture
+from pythonfmu import FmuBuilder
 
 from softneck.design import FopiSettings, HinfSettings, MpcSettings, PiSettings
 from softneck.estimation import KalmanSettings
@@ -37,10 +39,32 @@ from softneck.runtime import Block
 from softneck.signals import Recording, signal
 
 from ..oracles.bake_off import bake_off_neck
-from .test_fmu import _trivial
 from .test_set_membership import arrays_of, motion
 
 STEPS = 2000
+_TRIVIAL = """
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
+
+class Trivial(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.y = 0.0
+        self.register_variable(Real("y", causality=Fmi2Causality.output))
+
+    def do_step(self, current_time, step_size):
+        return True
+"""
+
+
+def _trivial(folder: Path) -> Path:
+    script = folder / "softneck_trivial_slave.py"
+    script.write_text(_TRIVIAL)
+    path = list(sys.path)
+    try:
+        return Path(FmuBuilder.build_FMU(script, dest=folder / "Trivial.fmu"))
+    finally:
+        sys.path[:] = path
+        sys.modules.pop("softneck_trivial_slave", None)
 
 
 @cache
