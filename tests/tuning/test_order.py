@@ -532,11 +532,22 @@ def test_the_distance_to_a_circle_is_least_at_the_lead_that_its_lag_asks_for(
 
 def test_the_radius_of_a_circle_is_that_of_its_last_turn_at_the_angles_of_the_page() -> None:
     task = task_for({"track": {"circle_rad_s": 2.0}})
-    found = _judge._radius(_circle(5, offset=0.05), task)
+    circle = _circle(5, offset=0.05)
+    turn = round(math.pi / circle.sample_time)
+    for name in ("pitch", "roll"):
+        circle.signals[name][:-turn] = 9.0  # what was before it does not count
+    found = _judge._radius(circle, task)
     angles = circle_angles()
     # A circle around (0.05, 0), seen from the origin.
     expected = 0.05 * np.cos(angles) + np.sqrt(0.04 - (0.05 * np.sin(angles)) ** 2)
     np.testing.assert_allclose(found, np.degrees(expected), rtol=2e-3)
+
+
+@pytest.mark.parametrize("linear", [{"f": 1}, {"f": 1, "m": 2}])
+def test_a_design_is_for_the_one_linear_plant_or_for_all_in_their_order(linear: dict[str, int]) -> None:
+    asked = make_tune_requirements({})
+    task = Task(digest="", linear=linear, own={}, asked=asked, robot=Robot.preset())
+    assert task.plant == (1 if len(linear) == 1 else [1, 2])
 
 
 def test_curves_are_of_the_plain_steps_from_the_lowest_to_the_highest(monkeypatch: pytest.MonkeyPatch) -> None:

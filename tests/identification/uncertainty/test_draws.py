@@ -184,6 +184,14 @@ def test_a_band_is_as_wide_as_its_farthest_draws_and_each_output_of_a_row_is_in_
         assert [row["class"] for row in found.coverage(Y, np.zeros(2), 0.0)] == ["small", "large"]
         assert not found.covers(Y, np.zeros(2), 0.0)
     assert segments(Y[0]).covers(Y, np.zeros(2), 0.0)
+    # A share that is the level is enough: 19 of 20 values.
+    many = rng.normal(size=(4, 40, 2))
+    y, groups, nothing = many[0].copy(), np.repeat([0, 1], 20), SimpleNamespace()
+    y[[3, 4, 23, 24], 0] = 99.0
+    told = _draws._Motions(nothing, nothing, y, groups, np.ones(2), np.array([0, 2]), np.zeros(2))  # pyright: ignore[reportArgumentType]
+    rows = told.coverage(many, np.zeros(2), 0.0)
+    assert [row["covered"] for row in rows] == [_draws.LEVEL, _draws.LEVEL]
+    assert told.covers(many, np.zeros(2), 0.0)
 
 
 @pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf])
