@@ -1173,7 +1173,7 @@ def test_the_first_whose_certificate_holds_is_taken_and_else_the_best(
     monkeypatch.setattr(_tune, "_verify_loop", verified)
     items = [replace(item, settings={"k": round(0.1 * (k + 1), 1)}) for k, item in enumerate(items)]
     search = searching()
-    most = _tune._MAX_VERIFICATIONS
+    most = 2
     monkeypatch.setattr(Search, "sort_candidates", lambda _: items)
     monkeypatch.setattr(_tune, "_most_attempts", lambda _: 3)
     found, count = _tune._verify_best(search, 0, None, lambda *_: None)
