@@ -64,6 +64,7 @@ class Drawn:
         conditions: metric -> draw and condition of each value.
         failed: numbers of the draws that fail a requirement.
         unreached: metric -> why the recordings do not support it, and what to record.
+        noisy: whether the sensor's noise would hide settling, so that steps are judged without it.
     """
 
     family: str
@@ -74,6 +75,7 @@ class Drawn:
     conditions: Mapping[str, list[dict[str, Any]]]
     failed: tuple[int, ...]
     unreached: Mapping[str, str] = field(default_factory=dict)
+    noisy: bool = False
 
     @property
     def content(self) -> float:
@@ -94,13 +96,14 @@ class Drawn:
 
     def statement(self) -> str:
         """Return what the loops over the draws say."""
+        quiet = "; steps are judged without the sensor's noise, which would hide settling" if self.noisy else ""
         if self.failed:
             doubt = f"; {self.draws.doubt}, so they decide little" if self.draws.doubt else ""
-            return f"{len(self.failed)} of {self.count} draws of {self.family} fail{doubt}"
+            return f"{len(self.failed)} of {self.count} draws of {self.family} fail{doubt}{quiet}"
         tries = "" if self.attempt == 1 else f" (attempt {self.attempt}, which is counted)"
         return (
             f"none of {self.count} draws of {self.family} fails: {100.0 * self.content:.1f} % of such plants hold, "
-            f"with {100.0 * _CONFIDENCE:.0f} % confidence{tries}"
+            f"with {100.0 * _CONFIDENCE:.0f} % confidence{tries}{quiet}"
         )
 
     def facts(self) -> dict[str, Any]:
@@ -167,7 +170,8 @@ def run_drawn(
         return _run_all(name, draws, controller, asked, order, observer, attempt, progress)
 
     found = compute_once(compute, name, draws, controller, asked.tables, limits, order, observer, attempt)
-    return replace(found, unreached=_unreached(draws, asked))
+    size = asked.scale.si(float(asked.sim["size_deg"]))
+    return replace(found, unreached=_unreached(draws, asked), noisy=not shows_settling(_noise(draws, asked), size))
 
 
 def _run_all(
@@ -275,8 +279,7 @@ def _step(task: _Task, plant: SimulationModel, number: int, kg: float, orientati
     step = RobotReference(kind="step", values=tuple(size * s for s in shares), at=at)
     block, connections, wanted = scale_loop_gain(task.controller, task.observer, outputs)
     parameters = {f"share_{axis}": float(s) for axis, s in zip(outputs, draws.share, strict=True)}
-    # A recording that is noisier than what is asked is believed.
-    noise = max(scale.si(float(asked.step["noise_deg"])), float(draws.noise.max()))
+    noise = _noise(draws, asked)
     told = "seen" if shows_settling(noise, size) else "without_noise"
     parameters |= {"keep": draws.keep, "noise": noise, "noise_seed": float(number)}
     loop = Loop(
@@ -302,6 +305,11 @@ def _step(task: _Task, plant: SimulationModel, number: int, kg: float, orientati
     if _has_load(task):
         found[f"sim.{name_of('load_rms_deg')}"] = math.inf if result is None else _load_rms(result, rows, asked)
     return found
+
+
+def _noise(draws: Draws, asked: Requirements) -> float:
+    """Return the standard deviation of the sensor's noise [SI]: a recording that is noisier than asked is believed."""
+    return max(asked.scale.si(float(asked.step["noise_deg"])), float(draws.noise.max()))
 
 
 def _has_load(task: _Task) -> bool:

@@ -144,8 +144,8 @@ def test_the_attempt_that_tune_certified_counts_for_its_controller(tmp_path: Pat
 
 def told_draws(**more: Any) -> Any:
     conditions = {"motion": [0.1, 0.4], "payload_kg": [0.0, 0.5], **more}
-    return SimpleNamespace(seed=7, doubt="", model=SimpleNamespace(kind="play"), coverage=[1], level=0.9,
-                           conditions=conditions, share=np.array([0.01, 0.02]), keep=0.9)  # fmt: skip
+    return SimpleNamespace(seed=7, doubt="", model=SimpleNamespace(kind="play"), coverage=[1], level=0.9, keep=0.9,
+                           conditions=conditions, share=np.array([0.01, 0.02]), noise=np.zeros(2))  # fmt: skip
 
 
 def test_draws_say_how_many_hold_at_which_attempt() -> None:
@@ -161,6 +161,9 @@ def test_draws_say_how_many_hold_at_which_attempt() -> None:
     assert (bad.content, bad.statement()) == (0.0, "2 of 59 draws of f fail")
     doubted = replace(bad, draws=SimpleNamespace(doubt="they differ"))  # pyright: ignore[reportArgumentType]
     assert doubted.statement() == "2 of 59 draws of f fail; they differ, so they decide little"
+    for item in (drawn(), bad):
+        quiet = "; steps are judged without the sensor's noise, which would hide settling"
+        assert replace(item, noisy=True).statement() == item.statement() + quiet
     assert bad.facts() == {
         "family": "f", "count": 59, "failed": [1, 4], "attempt": 1, "content": 0.0, "confidence": 0.95, "seed": 7,
         "kind": "play", "coverage": [1], "level": 0.9, "statement": "2 of 59 draws of f fail",
@@ -577,6 +580,10 @@ class ToldDraws:
     conditions: dict[str, list[float]]
     seed: int = 7
 
+    @property
+    def noise(self) -> np.ndarray:
+        return np.zeros(1)
+
     def for_certificate(self, attempt: int) -> list[int]:
         return [attempt] * 3
 
@@ -598,7 +605,10 @@ def test_equal_loops_run_once_and_every_other_attempt_limit_or_draw_runs_its_own
     monkeypatch.setattr(ToldDraws, "model", None, raising=False)
 
     def run(limit: float = 10.0, attempt: int = 1, seed: int = 7, bound: str = "max", **more: Any) -> Drawn:
-        asked = make_requirements({"sim": {"decides": True, **more}, "require": {"sim.overshoot_pct": {bound: limit}}})
+        step = more.pop("step", {})
+        asked = make_requirements(
+            {"sim": {"decides": True, **more}, "step": step, "require": {"sim.overshoot_pct": {bound: limit}}}
+        )
         draws: Any = ToldDraws({"motion": [0.4], "payload_kg": [0.0]}, seed)
         return run_drawn(
             "once", draws, pi().block(), asked, order="sequential", observer=None, attempt=attempt,
@@ -617,7 +627,9 @@ def test_equal_loops_run_once_and_every_other_attempt_limit_or_draw_runs_its_own
     payloads = make_requirements({}).sim["payloads_kg"]
     assert "sim" in run(payloads_kg=payloads).unreached
     assert not again.unreached
-    assert len(runs) == 15
+    # Four deviations of 0.19 deg are more than 5 % of 15 deg.
+    assert [run(step={"noise_deg": noise}).noisy for noise in (0.18, 0.19)] == [False, True]
+    assert len(runs) == 21
 
 
 def test_each_kind_of_margin_is_bisected_on_the_draws_that_swing_most(monkeypatch: pytest.MonkeyPatch) -> None:
