@@ -82,7 +82,11 @@ class World:
                 del os.environ[name]
         self.wait(lambda: "STATUS=running" in self.told or self.host.poll() is not None, "the loop", 60.0)
         if self.host.poll() is not None:
-            raise RuntimeError(f"the host ended: {self.host.communicate()}")
+            code, result, line = self.ended()
+            # Drives are guarded within 0.1 s: the host may meet their emergency before it sees that it stood still.
+            longest = result.get("longest_step_s", 0.0)
+            stood = f": a step stood still for {longest:.3f} s" if longest > 0.1 else ""
+            raise RuntimeError(f"the host ended before its case with {code}: {line}{stood}; {result}")
 
     def run(self, loop: str, *, arm: bool = True, realtime: bool = True) -> Any:
         """Start `softneck drives run`."""
