@@ -209,8 +209,6 @@ def _distances(loop: Loop, task: Task) -> Vector:
 LEVELS = ("linear", "all", "margins")
 # Linear plants of a linear check (nominal, corners, samples); a certificate has hundreds.
 _PLANT_COUNT = 48
-# The worse of two values of a metric is the smaller one of these.
-LARGE = LARGE
 
 
 @dataclass(frozen=True, slots=True, eq=False)

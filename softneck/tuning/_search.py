@@ -179,7 +179,7 @@ class Search:
         """Search near the best, and judge the final candidates, of each kind one first, by margins and all draws."""
         self._refine(self.levels, finals)
         if finals:
-            last = [item for item in self.sort_candidates() if item.level == self.levels[-1]]
+            last = [item for item in self.sort_candidates() if item.level == "all"]
             self._judge_finals(best_of_kinds(last)[:finals])
 
     def _judge_finals(self, items: Sequence[Candidate]) -> None:

@@ -326,7 +326,7 @@ def _drawn_in_search(task: Task, item: Candidate, observer: Block | None = None)
 def _more_kept(kept: Mapping[str, float], failed: Sequence[Verdict]) -> dict[str, float]:
     """Return how far a search stays within its limits where draws have smaller margins than the plants that led it."""
     short = {v.requirement.metric: v.requirement.limit - (v.value or 0.0) for v in failed
-             if v.requirement.metric in MARGINS and v.requirement.metric in kept}  # fmt: skip
+             if v.requirement.metric in MARGINS}  # fmt: skip
     return {metric: value + short.get(metric, 0.0) for metric, value in kept.items()}
 
 
@@ -461,9 +461,7 @@ def _verify_best(
     """Return the first of the best whose certificate holds, else the best, and the number of verifications so far."""
     compared, found = _compared(search), []
     promising = [item for item in compared if search.cost(item) <= 1.0][:_MAX_VERIFICATIONS] or compared[:1]
-    for number, item in enumerate(promising, start=tried + 1):
-        if number > _most_attempts(search.task):
-            break
+    for number, item in zip(range(tried + 1, _most_attempts(search.task) + 1), promising, strict=False):
         progress((number - tried - 1) / len(promising), f"verify {item.kind}")
         found.append(_certify(search.task, item, files, number))
         if found[-1].verification.holds:

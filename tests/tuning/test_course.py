@@ -143,6 +143,7 @@ def test_the_kinds_that_are_named_are_searched_once_each_and_else_the_usual_ones
     found = begun(monkeypatch, kinds=kinds, budget=7, seed=3)
     assert tuple(space.kind for space in found.spaces) == (searched or KINDS_SEARCHED)
     assert (found.budget, found.task.seed, found.dropped, found.log.folder) == (7, 3, {}, None)
+    assert (found.finals, found.earlier) == (4, 0)
     assert found.task.digest == digest_of(found.task, searched or KINDS_SEARCHED, None)
 
 

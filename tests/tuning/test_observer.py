@@ -114,6 +114,9 @@ def test_in_which_order_things_are_asked_is_no_other_search(task: Task) -> None:
     )
     other = replace(task, asked=replace(asked, track=turned(dict(asked.track)), certificate=certificate))
     assert digest_of(other, ("pi",), None) == digest_of(task, ("pi",), None)
+    tested = {"a": 1, "b": {"c": 2, "d": 3}}
+    one, same = (with_findings(task, tested=findings) for findings in (tested, turned(tested)))
+    assert digest_of(one, ("pi",), None) == digest_of(same, ("pi",), None)
     assert digest_of(replace(task, seed=task.seed + 1), ("pi",), None) != digest_of(task, ("pi",), None)
 
 

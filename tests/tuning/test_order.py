@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from softneck.cli._tune import command as tune_command
 from softneck.core import KINDS, CheckFailedError, DataError, SettingsError, metric_of, resolve
 from softneck.loop import LoopResult, RobotReference
-from softneck.robot import Robot
+from softneck.robot import Robot, Scaling
 from softneck.tuning import _judge, _search, _tune, task_of
 from softneck.tuning._judge import (
     LEVELS,
@@ -109,6 +109,8 @@ def test_a_circle_is_judged_by_the_worst_plant_at_one_lead_for_all(monkeypatch: 
 
 
 AXES = ("pitch", "roll")
+# A linear check is of the controller in the order of its design, without an observer, in one thread of its worker.
+ALONE = {"order": None, "observer": False}
 OWN = [f"{axis}.{last}" for axis in AXES for last in (*LARGE, *SMALL)]
 LINEAR = [*OWN, "stability.radius", "mimo.disk_margin", "step.rise_s", "step.coupling_deg"]
 
@@ -192,18 +194,22 @@ def test_linear_checks_are_of_plants_as_late_as_the_loop_and_of_the_data_where_n
     plants = SimpleNamespace(later=lambda samples: SimpleNamespace(axes=AXES, samples=samples))
     one = SimpleNamespace(laws={"": "law"}, extra=extra, block="block")
     asked: list[Any] = []
-    monkeypatch.setattr(_judge, "controller_under_test", lambda *_, **__: one)
+    named: list[Any] = []
+    monkeypatch.setattr(_judge, "controller_under_test", lambda *given, **more: named.append((given, more)) or one)
     monkeypatch.setattr(_judge, "margins", lambda *given: asked.append(given) or {})
     monkeypatch.setattr(_judge, "data_margins", lambda *given: asked.append(given) or [])
-    monkeypatch.setattr(_judge, "run_steps", lambda *given, **_: asked.append(given) or SimpleNamespace(metrics={}))
+    steps = SimpleNamespace(metrics={})
+    monkeypatch.setattr(_judge, "run_steps", lambda *given, **more: named.append(more) or asked.append(given) or steps)
     task = _task()
     task.drawn, task.linear = drawn, {"f": 1}
-    assert linear_metrics(task, SimpleNamespace(plants=plants, weights=None), None) == {}  # pyright: ignore[reportArgumentType]
+    assert linear_metrics(task, SimpleNamespace(plants=plants, weights="W"), "c") == {}  # pyright: ignore[reportArgumentType]
+    assert named == [(("c",), ALONE), {"workers": 1, "robot": task.robot, "weights": "W"}]
     by_data = [] if drawn else [({"f": 1}, "law", AXES, extra, -1.0)]
     assert [given for given in asked if given[0] == {"f": 1}] == by_data
     linear = [given for given in asked if given[0] != {"f": 1}]
     assert [given[0].samples for given in linear] == [extra, extra]
     assert [given[1] for given in linear] == ["law", "block"]
+    assert linear[1][2] == task.seed
 
 
 @pytest.mark.parametrize("name", ["axes.gain_margin", "axes.delay_margin_ms"])
@@ -235,6 +241,7 @@ def _case(monkeypatch: pytest.MonkeyPatch, case: Case, values: dict[str, float],
     asked: list[str] = []
 
     def judge(loop: Any, *, compiled: bool, angle: str) -> Any:
+        assert compiled  # thousands of loops
         asked.append(angle)
         return values, result
 
@@ -264,12 +271,18 @@ def test_a_final_candidate_is_judged_on_its_own_plants_and_on_all_draws_of_each_
         return SimpleNamespace(values={name: np.array(values[family])})
 
     monkeypatch.setattr(_judge, "run_drawn", run)
-    monkeypatch.setattr(_judge, "loops_under_test", lambda _, own, *__, **___: [plant.name for plant in own])
     tried: list[Any] = []
-    monkeypatch.setattr(_judge, "crossings", lambda loops, **_: tried.extend(loops) or loops)
+
+    def loops(block: str, own: Any, certificate: Any, **more: Any) -> list[str]:
+        tried.append((block, certificate, more))
+        return [plant.name for plant in own]
+
+    monkeypatch.setattr(_judge, "loops_under_test", loops)
+    monkeypatch.setattr(_judge, "crossings", lambda loops, **more: tried.append((loops, more)) or loops)
     monkeypatch.setattr(_judge, "crossing_values", lambda loops: {"axes.gain_margin": ([9.0] * len(loops), loops)})
     found = margin_metrics(task, SimpleNamespace(own=plants), "block", "parallel", "eyes")  # pyright: ignore[reportArgumentType]
-    assert tried == ["mine"]
+    asked_for = ("block", task.asked.certificate, {"order": "parallel", "observer": "eyes"})
+    assert tried == [asked_for, (["mine"], {"overall": True})]
     # Attempt 0: no draw of a certificate is seen. The draws that lead the search are among them.
     assert asked == [(f, f.upper(), "block", "parallel", "eyes", 0) for f in "fg"]
     assert found == {"axes.gain_margin": 9.0, name: 1.0 if metric_of(name).larger else 4.0}
@@ -284,6 +297,23 @@ def test_a_case_tells_all_that_is_judged_and_only_slack_may_be_unknown(monkeypat
             assert f"sim.{name}" not in found
         else:
             assert math.isnan(found[f"sim.{name}"])
+
+
+@pytest.mark.parametrize("circle", [False, True])
+def test_a_circle_tells_distances_and_no_metrics_and_a_step_the_other_way_round(
+    circle: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = _task()
+    task.asked.shows_settling = lambda _: True
+    case = Case(1, 0.5, noise=True, circle=circle)
+    given = (case, "plant", "block", "parallel", task, "eyes")
+    judged: list[Any] = []
+    monkeypatch.setattr(_judge, "loop_of", lambda *told: told)
+    monkeypatch.setattr(_judge, "_distances", lambda *told: told)
+    monkeypatch.setattr(_judge, "judge_loop", lambda loop, **_: judged.append(loop) or (VALUES, None))
+    metrics, distances = run_case(*given)  # pyright: ignore[reportArgumentType]
+    assert judged == [given] * (not circle)
+    assert (bool(metrics), distances) == ((False, (given, task)) if circle else (True, None))
 
 
 def test_percentages_of_a_small_step_are_left_out_and_its_variation_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -311,6 +341,9 @@ def test_variation_is_of_all_motors_and_moves_up_and_down() -> None:
     assert variation(of_bellows) == pytest.approx(10 * 0.3 / (10 * TS))  # bar/s
 
 
+PAIR: Any = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
 def test_curves_have_set_points_and_their_common_part_in_the_motors_unit() -> None:
     # Of the last plant. What moves no output is the mean of four chambers in a ring, and nothing where each is alone.
     y, P = np.array([[0.0, 3.0], [2.0, 1.0]]), 1e5 * np.array([[1.0, 1.0, 1.0, 1.0], [0.5, 1.0, 2.0, 2.5]])
@@ -325,7 +358,7 @@ def test_curves_have_set_points_and_their_common_part_in_the_motors_unit() -> No
     alone: Any = SimpleNamespace(weights=LEARNED)
     assert _judge._step_curves(task, alone, y, P).keys() == found.keys()
     # Two of four that pull against each other are enough: their part of the mean.
-    pair: Any = SimpleNamespace(weights=np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]))
+    pair: Any = SimpleNamespace(weights=PAIR)
     assert _judge._step_curves(task, pair, y, P)["tautness"] == pytest.approx([0.5, 0.375])
 
 
@@ -511,14 +544,18 @@ def _circle(lag: int, rows: int = 700, offset: float = 0.0) -> LoopResult:
 def test_the_distance_to_a_circle_is_least_at_the_lead_that_its_lag_asks_for(
     lag: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_judge, "run_loop", lambda *_, **__: _circle(lag))
     task, loop = task_for({"track": {"circle_rad_s": 2.0}}), SimpleNamespace(controller=SimpleNamespace(sample_time=TS))
+    circle = _circle(lag, offset=0.05)
+    for name in ("pitch", "roll"):
+        circle.signals[name][: -round(math.pi / TS)] = 9.0  # what was before the last turn does not count
+    monkeypatch.setattr(_judge, "run_loop", lambda _, compiled: circle if compiled else None)
     found = _judge._distances(loop, task)  # pyright: ignore[reportArgumentType]
     # 0.8 s of leads, each a sample.
     assert found.shape == (41,)
     leads = np.arange(41)
-    expected = np.degrees(0.4 * np.abs(np.sin((leads - lag) * TS)))
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    # Beside its centre too; 157 samples are a turn to 0.05 %, by which the middle of the cosine is off.
+    expected = np.degrees(np.hypot(0.4 * np.sin((leads - lag) * TS), 0.05))
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
 
     slow = task_for({"track": {"circle_rad_s": 2.0}}, time=3.0)
     assert _judge._distances(loop, slow).shape == (121,)  # pyright: ignore[reportArgumentType]
@@ -527,12 +564,18 @@ def test_the_distance_to_a_circle_is_least_at_the_lead_that_its_lag_asks_for(
         raise DataError("overflow")
 
     monkeypatch.setattr(_judge, "run_loop", overflow)
-    assert np.isinf(_judge._distances(loop, task)).all()  # pyright: ignore[reportArgumentType]
+    assert list(_judge._distances(loop, task)) == [math.inf] * 41  # pyright: ignore[reportArgumentType]
 
 
-def test_the_radius_of_a_circle_is_that_of_its_last_turn_at_the_angles_of_the_page() -> None:
-    task = task_for({"track": {"circle_rad_s": 2.0}})
+@pytest.mark.parametrize("middle", [0.0, 0.3])
+def test_the_radius_of_a_circle_is_that_of_its_last_turn_at_the_angles_of_the_page(middle: float) -> None:
+    """Around where the robot is operated."""
+    neck = Robot.preset()
+    range_of = {"min": (middle - 0.2,) * 2, "max": (middle + 0.2,) * 2, "rest": (middle,) * 2}
+    task = task_for({"track": {"circle_rad_s": 2.0}}, robot=replace(neck, outputs=replace(neck.outputs, **range_of)))
     circle = _circle(5, offset=0.05)
+    for name in ("pitch", "roll"):
+        circle.signals[name][:] += middle
     turn = round(math.pi / circle.sample_time)
     for name in ("pitch", "roll"):
         circle.signals[name][:-turn] = 9.0  # what was before it does not count
@@ -553,25 +596,27 @@ def test_a_design_is_for_the_one_linear_plant_or_for_all_in_their_order(linear: 
 def test_curves_are_of_the_plain_steps_from_the_lowest_to_the_highest(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps without noise, of full size, along the first output; the last plant's own curve and set-points."""
     task = task_for({"track": {"circle_rad_s": 2.0}}, own={"a": None})
-    plants = [0, 1]
+    plants = [0, 1, 2]
     every = [
         Case(k, 0.0, angle, noise=noisy) for k in plants for angle in (math.pi / 2, 0.0) for noisy in (True, False)
     ]
-    every += [Case(1, 0.0, part=0.3), Case(1, 0.0, late=True)]
+    every += [Case(2, 0.0, part=0.3), Case(2, 0.0, late=True)]
     run: list[Case] = []
     bent = 0.07  # [rad] where it stands before
 
     def result(loop: Any, *, compiled: bool) -> LoopResult:
+        assert compiled
         run.append(loop.case)
         loop = loop.case
         if loop.circle:
             return _circle(2 + loop.plant)
         t = np.arange(300) * TS
         on = (t >= 0.5 - 1e-9).astype(float)
-        size = 0.1 * (1 + loop.plant)
+        size = (0.3, 0.1, 0.2)[loop.plant]
         signals = {"pitch": bent + size * on, "roll": 9.0 * on, "pitch_reference": bent + 0.2 * on,
                    "roll_reference": 0.0 * on}  # fmt: skip
-        moved = {f"motor_setpoint_{j}": j * (1.0 + np.arange(300) - 25) * on for j in (1, 2, 3)}
+        share = (5.0, 3.0, 1.0)[loop.plant]
+        moved = {f"motor_setpoint_{j}": share * j * (1.0 + np.arange(300) - 25) * on for j in (1, 2, 3)}
         return LoopResult(t, signals | moved, {}, TS)
 
     still = RobotReference(kind="step", values=(0.2, 0.0), at=0.5)
@@ -583,9 +628,9 @@ def test_curves_are_of_the_plain_steps_from_the_lowest_to_the_highest(monkeypatc
         return _judge.loop_curves(task, ready, None, "sequential")  # pyright: ignore[reportArgumentType]
 
     found = curves(every)
-    assert run == [Case(0, 0.0), Case(1, 0.0)]
+    assert run == [Case(k, 0.0) for k in plants]
     assert (found["low"][-1], found["high"][-1], found["value"][-1]) == pytest.approx(
-        (math.degrees(0.1), math.degrees(0.2), math.degrees(0.2)), rel=1e-3
+        (math.degrees(0.1), math.degrees(0.3), math.degrees(0.2)), rel=1e-3
     )
     assert found["low"][0] == pytest.approx(math.degrees(0.1), rel=1e-3)
     assert found["reference"] == [pytest.approx(math.degrees(0.2), rel=1e-3)]
@@ -619,15 +664,21 @@ def test_linear_curves_are_of_the_first_output_with_the_nominal_plant_last(monke
     P[0, 0] = (1.0 + np.arange(400))[:, None] * [1.0, 2.0, 3.0]
     tests: list[Any] = []
 
-    def run(plants: Any, block: Any, test: Any, **_: Any) -> Any:
+    def run(plants: Any, block: Any, test: Any, **more: Any) -> Any:
         tests.append(test)
+        assert (plants, block) == (("later", 1), "block")
+        assert more == {"workers": 1, "robot": task.robot, "weights": None}
         return SimpleNamespace(time=t, angles=y, motors=P)
+
+    def alone(controller: Any, **more: Any) -> Any:
+        assert (controller, more) == ("c", ALONE)
+        return SimpleNamespace(extra=1, block="block")
 
     plants: Any = SimpleNamespace(later=lambda extra: ("later", extra))
     monkeypatch.setattr(_judge, "run_steps", run)
-    monkeypatch.setattr(_judge, "controller_under_test", lambda *_, **__: SimpleNamespace(extra=1, block=None))
+    monkeypatch.setattr(_judge, "controller_under_test", alone)
     task = task_for({"step": {"duration_s": 4.0}})
-    found = _judge.linear_curves(task, SimpleNamespace(plants=plants, weights=None), None)  # pyright: ignore[reportArgumentType]
+    found = _judge.linear_curves(task, SimpleNamespace(plants=plants, weights=None), "c")  # pyright: ignore[reportArgumentType]
     assert (tests[0].noise, tests[0].load) == (0.0, 0.0)
     ends = [found[name][-1] for name in ("low", "high", "value")]
     assert ends == pytest.approx([math.degrees(v) for v in (0.1, 0.3, 0.2)], rel=1e-3)
@@ -643,6 +694,9 @@ def test_curves_last_as_long_as_the_steps_that_they_are_of_and_are_denser_at_the
     times = curve_times(task_for({"sim": {"duration_s": 7.0}, "step": {"duration_s": 4.0}}, own=own))
     assert (times[0], times[-1]) == (0.0, duration)
     assert (np.diff(times, 2) > 0.0).all()
+    # A circle is looked at all the way round.
+    np.testing.assert_allclose(np.diff(circle_angles()), math.tau / 48)
+    assert circle_angles()[0] == -math.pi
 
 
 @pytest.mark.parametrize("drawn", [(), ("f, draw 1",)])
@@ -1069,11 +1123,14 @@ def test_a_search_judges_starts_generations_neighbours_and_finals_within_its_bud
     assert (said[-1] == ("margins", finals)) is bool(finals)
 
 
-@pytest.mark.parametrize(("budget", "level"), [(500, "all"), (9, "all"), (500, "linear")])
+@pytest.mark.parametrize(
+    ("budget", "level", "levels"),
+    [(500, "all", LEVELS[:2]), (9, "all", LEVELS[:2]), (500, "linear", LEVELS[:2]), (500, "linear", LEVELS[:1])],
+)
 def test_neighbours_of_the_best_are_judged_on_both_sides_until_none_is_better(
-    budget: int, level: str, monkeypatch: pytest.MonkeyPatch
+    budget: int, level: str, levels: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    search, rounds = searching("a", budget=budget), list[tuple[np.ndarray, np.ndarray]]()
+    search, rounds, asked = searching("a", budget=budget), list[tuple[np.ndarray, np.ndarray]](), levels
     best = np.array([0.4, 0.6])
     valley = np.array([0.55, 0.45])
 
@@ -1085,15 +1142,15 @@ def test_neighbours_of_the_best_are_judged_on_both_sides_until_none_is_better(
     monkeypatch.setattr(Search, "_candidate", lambda _, __, x: x)
 
     def judge(_: Search, near: Any, levels: Any, finals: int) -> None:
-        assert (levels, finals) == (LEVELS[:2], 3)
+        assert (levels, finals) == (asked, 3)
         rounds.append((search.sort_candidates()[0].x, np.array(near)))
         for x in near:
-            judged(x, LEVELS[1])
+            judged(x, levels[-1])
             search.spent.add(Job("a", str(len(search.spent)), "all"))
 
     monkeypatch.setattr(Search, "_judge_levels", judge)
-    search._refine(LEVELS[:2], 3)
-    if level == "linear":  # the best was not judged to its end
+    search._refine(levels, 3)
+    if level != levels[-1]:  # the best was not judged to its end
         assert not rounds
         return
     # Four to a round, while more is left than the finals need.
@@ -1324,9 +1381,10 @@ def test_a_certificate_resumes_a_search_unless_little_speed_alone_fails_or_no_dr
             _tune._certify_search(search, None, lambda *_: None)
     else:
         assert _tune._certify_search(search, None, lambda *_: None) == (search, certified, tried)
-    # A margin that nothing told counts as none.
-    kept = _tune._more_kept({"axes.gain_margin": 0.2}, [Verdict(LIMITS[2], None, False, {})])
-    assert kept == {"axes.gain_margin": pytest.approx(2.2)}
+    # A margin that nothing told counts as none; what is kept of other limits stays.
+    kept = _tune._more_kept({"axes.gain_margin": 0.2, "sim.overshoot_pct": 1.6},
+                            [Verdict(LIMITS[2], None, False, {}), Verdict(LIMITS[1], 9.0, False, {})])  # fmt: skip
+    assert kept == {"axes.gain_margin": pytest.approx(2.2), "sim.overshoot_pct": 1.6}
     # What loops of a search say decides only where there are draws among them.
     item = Candidate("a", {}, np.zeros(1), "margins", {"sim.overshoot_pct": 9.0})
     assert [v.requirement for v in _tune._failed_in_search(task, item)] == [LIMITS[1]]
@@ -1415,7 +1473,8 @@ def ended(
     task = task_for({}, own={"p": 1} if own else {}, bounds=bounds, tested=False)
     metrics = {"sim.rise_s": m, "axes.sensitivity": 1.0, "track.ahead_rms_deg": ahead}
     best = Candidate("pi", {}, np.zeros(1), level, metrics)
-    failed = [SimpleNamespace(value=value, requirement=bounds[0]) for holds, value in verified if not holds]
+    failed = [SimpleNamespace(value=value, requirement=bounds[min(k, 1)])
+              for k, (holds, value) in enumerate(verified) if not holds]  # fmt: skip
     verification = SimpleNamespace(holds=not failed, failed=failed)
     certified = _tune._Certified(best, SimpleNamespace(design={}), False, verification)  # pyright: ignore[reportArgumentType]
     monkeypatch.setattr(_tune, "prepare", lambda _: SimpleNamespace(own=()))
@@ -1437,8 +1496,9 @@ def test_a_result_holds_where_its_certificate_its_loops_and_its_search_do(monkey
     # The certificate covers more plants than the search; of two that fail there is no nearest value.
     what, found = ended(monkeypatch, verified=[(False, 1.2)])
     assert (what, found.holds, found.binding, found.nearest) == ("relaxed", False, "sim.rise_s", 1.2)
-    _, found = ended(monkeypatch, verified=[(False, 1.2), (False, None)])
-    assert (found.binding, found.nearest) == ("sim.rise_s", None)
+    for others in ([None], [1.4, 1.3]):
+        _, found = ended(monkeypatch, verified=[(False, 1.2), *((False, value) for value in others)])
+        assert (found.binding, found.nearest) == ("sim.rise_s", None)
     _, found = ended(monkeypatch, verified=[(False, None)])
     assert (found.holds, found.binding) == (False, None)
     # A search that ended before its loops promises nothing, and relaxes nothing; without models there are no loops.
@@ -1504,6 +1564,7 @@ def test_the_rise_that_is_aimed_at_is_the_shortest_asked_or_two_time_constants()
     ("made", "held"),
     [
         ([], None), ([([0.0, 0.0], [0.2, 0.6])], 0.4), ([([0.0, 0.0], [-0.6, 0.6])], None),
+        ([([0.0, 0.0], [0.05, 0.05])], None), ([([0.0, 0.0], [0.05, 0.052])], 0.051),
         # Of the heaviest load, the middle one of several.
         ([([0.0, 0.0], [2.0, 2.0]), ([0.5, 1.0], [0.5, 0.7]), ([1.0, 1.0], [0.1, 0.3]), ([1.0, 1.0], [1.0, 1.2])], 0.6),
     ],
@@ -1515,6 +1576,14 @@ def test_the_cocontraction_of_loops_is_the_recordings_with_the_heaviest_load(
     thing = SimpleNamespace(findings={"tested": {"conditions": parts}}, robot=Robot.preset())
     found = _tune._recorded_cocontraction({"f": thing}, Robot.preset())
     assert found == (None if held is None else pytest.approx(held))
+    # Two of four chambers that pull against each other are enough; where none does there is nothing to hold.
+    unit = Scaling.of(BELLOWS).motor_unit
+    parts = [{"payload_kg": kg, "cocontraction": [unit * end for end in ends]} for kg, ends in made]
+    findings = {"tested": {"conditions": parts}}
+    for expected, weights in ((held, PAIR), (None, LEARNED)):
+        own = SimpleNamespace(findings=findings, robot=BELLOWS, directions=weights)
+        found = _tune._recorded_cocontraction({"f": own}, BELLOWS)
+        assert found == (None if expected is None else pytest.approx(unit * expected))
 
 
 def test_a_search_without_candidates_has_nothing_in_its_way_and_its_defaults_are_those_of_the_command() -> None:
@@ -1598,7 +1667,7 @@ def test_where_the_best_fails_in_more_the_best_of_another_kind_is_verified_and_r
     assert relaxed(monkeypatch, items, {}, 3)[1] == []
     # One that fails in its margins in the search is left out, and one that could not be judged to its end.
     poor, lost = rising("lqg"), replace(rising("lqg"), error="it diverged")
-    poor.metrics["axes.sensitivity"] = 9.0
+    poor.metrics["axes.sensitivity"] = 1.01 * (make_tune_requirements({}).limit("axes.sensitivity") or math.nan)
     assert relaxed(monkeypatch, [items[0], poor, lost], {}, 1)[1] == []
 
 

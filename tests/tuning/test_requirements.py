@@ -157,6 +157,7 @@ def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
         ({"reserve": {"sim.ris_s": 0.1}}, r"which \[require\] does not limit"),
         ({"reserve": 1.0}, "must be a table"),
         ({"require": 1.0}, "must be a table"),
+        ({"track": 1.0}, r"must be a table: \[track\]"),
         ({"require": {"sim.rise_s": {"min": 1.0, "max": 0.4}}}, "cannot be at least 1 and at most"),
         ({"require": {"sim.rise_s": {"min": 3.0}, "sim.settling_s": {"max": 2.0}}}, "cannot"),
     ],
@@ -286,6 +287,20 @@ def test_what_settles_before_it_can_rise_and_an_Ms_of_one_are_refused() -> None:
             check_feasibility(asked, neck())
 
 
+def test_what_is_not_asked_refuses_nothing() -> None:
+    """A plant that no default could be met on, of which each refusal alone is asked for by turns."""
+    slow = LinearNeck(pitch=axis(POLE, 60, 0.1 * GAIN), roll=axis(POLE, 60, 0.1 * GAIN))
+    # Something must be asked for; mu depends on no plant.
+    none = {item.metric: False for item in make_tune_requirements({}).bounds if item.metric != "robust.mu"}
+    check_feasibility(make_tune_requirements({"require": none}), slow)
+    for metric, limit in (("sim.rise_s", 0.5), ("sim.settling_s", 2.0), ("track.circle_rms_deg", 1.0),
+                          ("track.ahead_rms_deg", 1.0), ("axes.sensitivity", 1.0), ("step.load_rms_deg", 0.01),
+                          ("sim.steady_rms_deg", 0.01)):  # fmt: skip
+        asked = make_tune_requirements({"require": none | {metric: {"max": limit}}})
+        with pytest.raises(SettingsError, match=f"`{metric}`"):
+            check_feasibility(asked, slow)
+
+
 def test_a_load_rejected_within_the_dead_time_is_refused() -> None:
     asked = make_tune_requirements({"require": {"step.load_rms_deg": {"max": 0.02}}})
     with pytest.raises(SettingsError, match="dead time before any feedback acts"):
@@ -312,6 +327,8 @@ def test_what_is_stated_is_what_a_table_limits_and_not_what_it_drops() -> None:
     asked = make_tune_requirements({"require": require, "track": {"delay_ms": 7.0}, "sim": {"size_deg": 9.0}})
     assert asked.stated == {"sim.rise_s", "track.circle_rms_deg", "track.delay_ms", "sim.size_deg"}
     assert make_tune_requirements({}).stated == frozenset()
+    # A metric is known by its name alone too.
+    assert make_tune_requirements({"circle_rms_deg": 4.0}).stated == {"track.circle_rms_deg"}
 
 
 @pytest.mark.parametrize(("delay", "rows"), [(0, 1), (4, 5), (50, 51), (150, 49), (199, 0), (300, 0)])
@@ -334,6 +351,7 @@ def test_settling_is_judged_by_the_sensor_up_to_the_noise_that_fits_the_band() -
         found = make_tune_requirements({"sim": {"size_deg": size}})
         asked = replace(found, track={**found.track, "noise_deg": noise})
         assert asked.shows_settling(part) == shown
+        assert part != 1.0 or asked.shows_settling() == shown
 
 
 def axis(pole: float, delay: int = DELAY, gain: float = GAIN) -> control.TransferFunction:
@@ -385,7 +403,14 @@ def test_the_default_rise_is_that_of_the_slowest_axis() -> None:
     assert rise(1.0, POLE) == rise(POLE, 1.0) == slow
     late = [LinearNeck(pitch=axis(POLE), roll=axis(POLE)), LinearNeck(pitch=axis(POLE), roll=axis(POLE, 60))]
     assert default_rise(late, asked) == rise(POLE, POLE, delay=60) > quick
+    # ln 9 dead times, with one sample of the loop, beside the motors' own; to hundredths of the robot's second.
+    least = least_rise_by_hand(math.radians(15.0))
+    for time in (1.0, 2.5):
+        stretched = replace(asked, certificate=replace(asked.certificate, scale=Scale(time=time)))
+        expected = time * round(least / time + math.log(9.0) * 61 * TS / time, 2)
+        assert default_rise(late, stretched) == pytest.approx(expected, abs=1e-9)
     assert rise(POLE, POLE, more=(POLE,)) == quick
     assert rise(40.0, 40.0) >= USUAL_RISE * TIME_CONSTANT
+    assert default_rise([LinearNeck(pitch=axis(POLE), roll=axis(POLE, gain=0.1 * GAIN))], asked) is None
     short = make_tune_requirements({"sim": {"size_deg": 15.0}, "require": {"sim.settling_s": {"max": 0.3}}})
     assert default_rise([LinearNeck(pitch=axis(1.0), roll=axis(1.0))], short) == short.robot_limit("sim.settling_s")

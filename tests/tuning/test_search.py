@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable
-from concurrent.futures import Future
+from concurrent.futures import BrokenExecutor, Future
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -194,6 +194,11 @@ def test_a_log_gives_back_what_was_judged_and_has_refusals_tried_again(tmp_path:
     again = Log(tmp_path, "d")
     assert refused in log.found
     assert again.found == {job: log.found[job]}
+    # One of a softneck that kept no curves is judged again.
+    content = json.loads((tmp_path / FILE).read_text())
+    del content["evaluations"][0]["curves"]
+    (tmp_path / FILE).write_text(json.dumps(content))
+    assert Log(tmp_path, "d").found == {}
     assert job == Job.of("pi", {"a": 1e-17 + 0.1, "b": 1.25}, "all")
 
 
@@ -221,6 +226,14 @@ def test_work_is_given_out_two_to_a_worker_and_all_of_it_comes_back() -> None:
     assert sorted(back, key=lambda pair: pair[1]) == [(job, job.settings) for job in jobs]
     # The better ones stand first: a search that is stopped has judged those.
     assert given == jobs
+
+
+def test_a_worker_that_dies_ends_a_search_with_what_to_do() -> None:
+    def run(_: Job) -> Future:
+        raise BrokenExecutor
+
+    with pytest.raises(SoftneckError, match=r"a worker process died .*; run the same command again"):
+        run_jobs([Job("pi", "", "all")], run, SimpleNamespace(size=1), lambda *_: None)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("kind", [*KINDS_SEARCHED, "nmpc"])
