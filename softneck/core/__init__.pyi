@@ -33,6 +33,7 @@ from ._units import to_si as to_si
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
 from ._archive import is_archive as is_archive
+from ._archive import require_header as require_header
 from ._blas_threads import one_blas_thread as one_blas_thread
 from ._certificate import CERTIFICATE_ENDING as CERTIFICATE_ENDING
 from ._certificate import CERTIFICATE_KINDS as CERTIFICATE_KINDS
@@ -64,7 +65,6 @@ from ._files import require_steps as require_steps
 from ._files import require_table as require_table
 from ._files import require_unpacked as require_unpacked
 from ._files import settings_text as settings_text
-from ._header import require_header as require_header
 from ._kinds import fitting as fitting
 from ._kinds import kinds_of as kinds_of
 from ._kinds import make_settings as make_settings

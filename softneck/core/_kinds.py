@@ -10,9 +10,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from ._archive import read_archive
+from ._archive import read_archive, require_header
 from ._errors import FileFormatError, SettingsError, did_you_mean
-from ._header import require_header
 
 
 @dataclass(frozen=True, slots=True)

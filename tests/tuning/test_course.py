@@ -13,7 +13,7 @@ from softneck.core import DataError, SettingsError
 from softneck.cosim.studies._run_study import SameProcess, WorkerPool
 from softneck.estimation import KalmanSettings
 from softneck.robot import Robot
-from softneck.tuning import _search, _tune, tune
+from softneck.tuning import _certify, _search, _tune, tune
 from softneck.tuning._search import Search
 from softneck.tuning._space import KINDS_SEARCHED, spaces
 from softneck.tuning._task import Judgement, Log, Task, digest_of
@@ -201,7 +201,7 @@ def test_a_tuning_says_how_far_it_is_from_nothing_to_all(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(_tune, "prepare", lambda _: None)
     monkeypatch.setattr(Search, "run", lambda self: course(self.report))
-    monkeypatch.setattr(_tune, "_certify_search", lambda *given: course(*given) or ("search", "best", 3))
+    monkeypatch.setattr(_tune, "certify_search", lambda *given: course(*given) or ("search", "best", 3))
     monkeypatch.setattr(_tune, "_make_result", lambda *given: course(*given) or given[:4])
     found = tune({"n": linear_neck()}, {}, kinds="pi", workers=0, files={"f": ("a", "b")},
                  progress=lambda share, _: said.append(share))  # fmt: skip
@@ -213,4 +213,4 @@ def test_a_tuning_says_how_far_it_is_from_nothing_to_all(monkeypatch: pytest.Mon
 def test_there_are_as_many_certificates_as_every_family_has_draws_for_and_at_most_five(attempts: list[int]) -> None:
     families = {str(k): SimpleNamespace(draws=SimpleNamespace(attempts=count)) for k, count in enumerate(attempts)}
     task: Any = SimpleNamespace(linear={"model": object(), "other": SimpleNamespace(draws=None), **families})
-    assert _tune._most_attempts(task) == min([5, *attempts])
+    assert _certify.most_attempts(task) == min([5, *attempts])

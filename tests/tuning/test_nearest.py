@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from softneck.cli._tune import _why
 from softneck.loop.default_limits import NECK_RISE_S
 from softneck.report._tune import _verdict_rows, failing_requirement, requirement_rows, tune_verdict
-from softneck.tuning import _tune
+from softneck.tuning import _compare
+from softneck.tuning._compare import Loosened, relaxations
 from softneck.tuning._requirements import TuneRequirements, make_tune_requirements, relax_limits
 from softneck.tuning._search import Candidate
-from softneck.tuning._tune import Loosened, relaxations
 from softneck.verification._decision import verdict_values
 from softneck.verification._requirements import Requirement
 from softneck.verification._verify import Verdict
@@ -189,22 +189,23 @@ def test_what_was_not_computed_is_not_said_to_hold() -> None:
 
 @given(st.floats(1e-6, 1e6))
 def test_a_limit_that_is_told_is_above_what_was_reached_by_five_percent_in_two_digits(value: float) -> None:
-    found, wanted = _tune._round_up(value), 1.05 * value
+    found, wanted = _compare._round_up(value), 1.05 * value
     digit = 10.0 ** (math.floor(math.log10(wanted)) - 1)
     assert wanted * (1.0 - 1e-9) <= found <= wanted + digit * (1.0 + 1e-6)
     assert found == pytest.approx(float(f"{found:.2g}"), rel=1e-11)
     # What another value of the same decade needs is never less for a larger one.
-    assert _tune._round_up(1.01 * value) >= found * (1.0 - 1e-12)
+    assert _compare._round_up(1.01 * value) >= found * (1.0 - 1e-12)
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
 def test_what_was_not_reached_has_no_limit(value: float) -> None:
-    assert _tune._round_up(value) == math.inf
+    assert _compare._round_up(value) == math.inf
 
 
 def test_the_limits_that_are_told_by_hand() -> None:
     # 1.05 of it, up to the next in two digits; one that is exact stays.
-    assert [_tune._round_up(value) for value in (1.0, 0.1, 2.0, 0.96, 9.6, 95.0)] == [1.1, 0.11, 2.1, 1.1, 11.0, 100.0]
+    rounded = [_compare._round_up(value) for value in (1.0, 0.1, 2.0, 0.96, 9.6, 95.0)]
+    assert rounded == [1.1, 0.11, 2.1, 1.1, 11.0, 100.0]
     words = Loosened(0.4, 0.4444, 0.47).in_words("sim.rise_s")
     assert words == "sim.rise_s: 0.444, by default 0.4 is required (certified: 0.47)"
 
@@ -224,5 +225,5 @@ def test_a_front_is_over_the_first_metric_of_each_kind_that_all_have(given: list
     full: Any = SimpleNamespace(metrics=dict.fromkeys([*given, "sim.max_rad"], 1.0))
     more: Any = SimpleNamespace(metrics=dict.fromkeys([*given, "robust.mu"], 1.0))
     none: Any = SimpleNamespace(metrics={})
-    assert _tune.objectives([full, more]) == _tune.objectives([more, full]) == named
-    assert _tune.objectives([full, none]) == _tune.objectives([]) == []
+    assert _compare.objectives([full, more]) == _compare.objectives([more, full]) == named
+    assert _compare.objectives([full, none]) == _compare.objectives([]) == []

@@ -18,7 +18,7 @@ from softneck.loop import BlockPart
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
 from softneck.signals import Recording, signal
-from softneck.tuning import _judge, _tune, tune
+from softneck.tuning import _certify, _judge, _tune, tune
 from softneck.tuning._judge import Case, design_candidate, loop_of, make_observer, prepare
 from softneck.tuning._space import spaces
 from softneck.tuning._task import Task, digest_of
@@ -265,11 +265,11 @@ def test_a_loop_is_delivered_with_the_observer_that_its_kind_needs_or_over_which
     held: bool, own: bool, eyes: Any, planned: bool, failed: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Seen on a valve in kPa: a filter of 2 ms took the gain margin of 43 of 59 draws, steps alone did not show it."""
-    monkeypatch.setattr(_tune, "make_observer", lambda *_: "eyes" if planned else None)
-    monkeypatch.setattr(_tune, "holds_with_observer", lambda *_: held)
+    monkeypatch.setattr(_certify, "make_observer", lambda *_: "eyes" if planned else None)
+    monkeypatch.setattr(_certify, "holds_with_observer", lambda *_: held)
     task: Any = SimpleNamespace(observer=eyes, own={"p": 1} if own else {}, bounds=())
     item: Any = SimpleNamespace(kind="pi")
     # A loop over the second family fails, with this observer in it.
     drawn = [SimpleNamespace(failed=()), SimpleNamespace(failed=failed)]
-    monkeypatch.setattr(_tune, "_drawn_in_search", lambda *told: drawn if told[2] == "seen" else [])
-    assert _tune._observed(task, item) is (planned or (eyes is not None and own and held and not failed))
+    monkeypatch.setattr(_certify, "_drawn_in_search", lambda *told: drawn if told[2] == "seen" else [])
+    assert _certify._observed(task, item) is (planned or (eyes is not None and own and held and not failed))

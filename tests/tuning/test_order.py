@@ -19,7 +19,8 @@ from softneck.cli._tune import command as tune_command
 from softneck.core import KINDS, CheckFailedError, DataError, SettingsError, metric_of, resolve
 from softneck.loop import LoopResult, RobotReference
 from softneck.robot import Robot, Scaling
-from softneck.tuning import _judge, _search, _tune, task_of
+from softneck.tuning import _certify, _compare, _judge, _search, _tune, task_of
+from softneck.tuning._compare import front
 from softneck.tuning._judge import (
     LEVELS,
     Case,
@@ -38,7 +39,6 @@ from softneck.tuning._requirements import make_tune_requirements
 from softneck.tuning._search import Candidate, Search, ratio
 from softneck.tuning._space import COSTLY, spaces
 from softneck.tuning._task import Job, Judgement, Task, circle_angles, curve_times
-from softneck.tuning._tune import front
 from softneck.verification import LARGE, SMALL, Scale, metric_names
 from softneck.verification._linear import AxisMargins
 from softneck.verification._requirements import Requirement
@@ -1187,28 +1187,28 @@ def test_a_step_over_an_observer_holds_where_every_loop_of_full_size_does(
         value = lost if lost is not None and len(run) - 1 == at else 1.0
         return {"rise_s": value, "slack_s": math.nan}, None
 
-    monkeypatch.setattr(_tune, "prepare", lambda _: ready)
-    monkeypatch.setattr(_tune, "design_candidate", lambda *_: controller)
-    monkeypatch.setattr(_tune, "loop_of", lambda *args: (*args[:2], args[3], args[5]))
-    monkeypatch.setattr(_tune, "judge_loop", judged)
+    monkeypatch.setattr(_certify, "prepare", lambda _: ready)
+    monkeypatch.setattr(_certify, "design_candidate", lambda *_: controller)
+    monkeypatch.setattr(_certify, "loop_of", lambda *args: (*args[:2], args[3], args[5]))
+    monkeypatch.setattr(_certify, "judge_loop", judged)
     bounds = (Requirement("sim.rise_s", "max", 1.0, True), Requirement("sim.slack_s", "max", 0.1, False))
     observer = SimpleNamespace(block=lambda: "eyes")
-    held = _tune.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, bounds)
+    held = _certify.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, bounds)
     assert held is (lost is None)
     assert run == [(every[0], 0, "parallel", "eyes"), (every[1], 1, "parallel", "eyes")]
     # An observer that makes the steps rise more than a tenth later is left out.
     for rise, quick in ((0.92, True), (0.9, False)):
         item = Candidate("pi", {}, np.zeros(1), metrics={"sim.rise_s": rise})
-        assert _tune.holds_with_observer(task, item, observer, bounds) is quick  # only the first two loops are lost
+        assert _certify.holds_with_observer(task, item, observer, bounds) is quick  # only the first two loops are lost
     ready.all = every[2:]
-    assert not _tune.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, bounds)
+    assert not _certify.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, bounds)
 
     def fails(*_: Any) -> Any:
         raise DataError("overflow")
 
     ready.all = every
-    monkeypatch.setattr(_tune, "judge_loop", fails)
-    assert not _tune.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, bounds)
+    monkeypatch.setattr(_certify, "judge_loop", fails)
+    assert not _certify.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, bounds)
 
 
 @pytest.mark.parametrize("holds", [[True], [False, True, True], [False, False, False], [False, False, False, True]])
@@ -1223,17 +1223,17 @@ def test_the_first_whose_certificate_holds_is_taken_and_else_the_best(
         tried.append(attempt)
         return SimpleNamespace(holds=holds[attempt - 1], number=attempt - 1)
 
-    monkeypatch.setattr(_tune, "prepare", lambda _: None)
-    monkeypatch.setattr(_tune, "design_candidate", lambda *settings: settings[-1]["k"])
+    monkeypatch.setattr(_certify, "prepare", lambda _: None)
+    monkeypatch.setattr(_certify, "design_candidate", lambda *settings: settings[-1]["k"])
     # What is verified is the loop that is delivered: with the observer where its steps hold with it.
-    monkeypatch.setattr(_tune, "_observed", lambda _, item: item.settings["k"] == 0.2)
-    monkeypatch.setattr(_tune, "_verify_loop", verified)
+    monkeypatch.setattr(_certify, "_observed", lambda _, item: item.settings["k"] == 0.2)
+    monkeypatch.setattr(_certify, "_verify_loop", verified)
     items = [replace(item, settings={"k": round(0.1 * (k + 1), 1)}) for k, item in enumerate(items)]
     search = searching()
     most = 2
     monkeypatch.setattr(Search, "sort_candidates", lambda _: items)
-    monkeypatch.setattr(_tune, "_most_attempts", lambda _: 3)
-    found, count = _tune._verify_best(search, 0, None, lambda *_: None)
+    monkeypatch.setattr(_certify, "most_attempts", lambda _: 3)
+    found, count = _certify._verify_best(search, 0, None, lambda *_: None)
     verification: Any = found.verification
     first = next((k for k, held in enumerate(holds[:most]) if held), None)
     assert found.item is items[first or 0]
@@ -1245,11 +1245,11 @@ def test_the_first_whose_certificate_holds_is_taken_and_else_the_best(
     # If none holds in the search, the best alone is verified; draws that another search had are not drawn again.
     tried.clear()
     monkeypatch.setattr(Search, "sort_candidates", lambda _: items[-1:] * 2)
-    assert _tune._verify_best(search, 0, None, lambda *_: None)[0].item is items[-1]
+    assert _certify._verify_best(search, 0, None, lambda *_: None)[0].item is items[-1]
     assert tried == [1]
     monkeypatch.setattr(Search, "sort_candidates", lambda _: [items[0]] * 2)
-    monkeypatch.setattr(_tune, "_verify_loop", lambda *rest: tried.append(rest[-1]) or SimpleNamespace(holds=False))
-    assert _tune._verify_best(search, 2, None, lambda *_: None)[1] == 3
+    monkeypatch.setattr(_certify, "_verify_loop", lambda *rest: tried.append(rest[-1]) or SimpleNamespace(holds=False))
+    assert _certify._verify_best(search, 2, None, lambda *_: None)[1] == 3
     assert tried == [1, 3]
 
 
@@ -1269,7 +1269,7 @@ LIMITS = (Requirement("sim.rise_s", "max", 1.0, False), Requirement("sim.oversho
 def resumable(monkeypatch: pytest.MonkeyPatch, values: dict[str, float], *, found: bool, holds: int) -> Any:
     """Return a search that ended with these values of its best, whose certificates hold from the attempt `holds` on.
 
-    Returns what `_certify_search` does, and the attempts.
+    Returns what `certify_search` does, and the attempts.
     """
     # Of a large rise and overshoot one draw is the worst, of a small margin another; each is made anew when asked for.
     part = SimpleNamespace(family="f", attempt=0, worst=lambda _, largest: 2 if largest else 1,
@@ -1308,13 +1308,13 @@ def resumable(monkeypatch: pytest.MonkeyPatch, values: dict[str, float], *, foun
     def certify(_: Any, item: Any, __: Any, attempt: int) -> Any:
         verified.append(attempt)
         fine = attempt >= holds
-        return _tune._Certified(item, "c", False, SimpleNamespace(  # pyright: ignore[reportArgumentType]
+        return _certify.Certified(item, "c", False, SimpleNamespace(  # pyright: ignore[reportArgumentType]
             holds=fine, failed=[] if fine else failed, evidence=SimpleNamespace(drawn=[part])))  # fmt: skip
 
-    monkeypatch.setattr(_tune, "_certify", certify)
-    monkeypatch.setattr(_tune, "prepare", lambda _: None)
-    monkeypatch.setattr(_tune, "_drawn_in_search", lambda *_: [part])
-    return search, _tune._certify_search(search, None, lambda *_: None), verified
+    monkeypatch.setattr(_certify, "certify", certify)
+    monkeypatch.setattr(_certify, "prepare", lambda _: None)
+    monkeypatch.setattr(_certify, "_drawn_in_search", lambda *_: [part])
+    return search, _certify.certify_search(search, None, lambda *_: None), verified
 
 
 FINE = {"sim.rise_s": 0.9, "sim.overshoot_pct": 4.0, "axes.gain_margin": 2.5}
@@ -1347,7 +1347,7 @@ def test_a_search_resumes_with_the_worst_draws_of_what_its_best_fails_but_a_litt
 
 
 def test_what_no_loop_over_draws_tells_resumes_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_tune, "_failing_draws", lambda *_: {})
+    monkeypatch.setattr(_certify, "_failing_draws", lambda *_: {})
     for values, holds in ((FINE | {"sim.overshoot_pct": 5.1}, 1), (FINE, 9)):
         search, (again, certified, tried), verified = resumable(monkeypatch, values, found=True, holds=holds)
         assert again is search
@@ -1369,27 +1369,27 @@ def test_a_certificate_resumes_a_search_unless_little_speed_alone_fails_or_no_dr
     search: Any = SimpleNamespace(task=task, sort_candidates=lambda: [best])
     verification = SimpleNamespace(holds=not failed, failed=failed, evidence=SimpleNamespace(drawn=[]))
     certified: Any = SimpleNamespace(item=best, verification=verification)
-    monkeypatch.setattr(_tune, "_verify_best", lambda *_: (certified, tried))
-    monkeypatch.setattr(_tune, "_failing_draws", lambda _, failed: {"draw 2": 1} if failed else {})
+    monkeypatch.setattr(_certify, "_verify_best", lambda *_: (certified, tried))
+    monkeypatch.setattr(_certify, "_failing_draws", lambda _, failed: {"draw 2": 1} if failed else {})
 
     def replaced(*_: Any, **__: Any) -> Any:
         raise KeyError("it resumes")
 
-    monkeypatch.setattr(_tune, "replace", replaced)
+    monkeypatch.setattr(_certify, "replace", replaced)
     if resumes:
         with pytest.raises(KeyError, match="it resumes"):
-            _tune._certify_search(search, None, lambda *_: None)
+            _certify.certify_search(search, None, lambda *_: None)
     else:
-        assert _tune._certify_search(search, None, lambda *_: None) == (search, certified, tried)
+        assert _certify.certify_search(search, None, lambda *_: None) == (search, certified, tried)
     # A margin that nothing told counts as none; what is kept of other limits stays.
-    kept = _tune._more_kept({"axes.gain_margin": 0.2, "sim.overshoot_pct": 1.6},
+    kept = _certify._more_kept({"axes.gain_margin": 0.2, "sim.overshoot_pct": 1.6},
                             [Verdict(LIMITS[2], None, False, {}), Verdict(LIMITS[1], 9.0, False, {})])  # fmt: skip
     assert kept == {"axes.gain_margin": pytest.approx(2.2), "sim.overshoot_pct": 1.6}
     # What loops of a search say decides only where there are draws among them.
     item = Candidate("a", {}, np.zeros(1), "margins", {"sim.overshoot_pct": 9.0})
-    assert [v.requirement for v in _tune._failed_in_search(task, item)] == [LIMITS[1]]
+    assert [v.requirement for v in _certify._failed_in_search(task, item)] == [LIMITS[1]]
     task.drawn = ()
-    assert _tune._failed_in_search(task, item) == []
+    assert _certify._failed_in_search(task, item) == []
 
 
 def test_at_most_three_draws_join_each_once_though_it_is_the_worst_in_several_metrics() -> None:
@@ -1399,15 +1399,15 @@ def test_at_most_three_draws_join_each_once_though_it_is_the_worst_in_several_me
                                model=lambda number: [family, number])  # fmt: skip
 
     failed: Any = [SimpleNamespace(requirement=Requirement(metric, "max", 1.0, False)) for metric in "abc"]
-    found = _tune._failing_draws([part("f", 4, 4, None), part("g", 4, 0, 4)], failed)
+    found = _certify._failing_draws([part("f", 4, 4, None), part("g", 4, 0, 4)], failed)
     assert found == {"f, attempt 2, a": ["f", 4], "g, attempt 2, a": ["g", 4], "g, attempt 2, b": ["g", 0]}
-    many = _tune._failing_draws([part("f", 4, 3, 2), part("g", 1, 0, 4)], failed)
+    many = _certify._failing_draws([part("f", 4, 3, 2), part("g", 1, 0, 4)], failed)
     assert list(many.values()) == [["f", 4], ["f", 3], ["f", 2]]
     # Of a margin the smallest is the worst, of all else the largest.
     sides: list[bool] = []
     asked: Any = [SimpleNamespace(requirement=Requirement("a", bound, 1.0, False)) for bound in ("min", "max", "below")]
     one: Any = SimpleNamespace(family="f", attempt=1, worst=lambda _, largest: sides.append(largest))
-    assert _tune._failing_draws([one], asked) == {}
+    assert _certify._failing_draws([one], asked) == {}
     assert sides == [False, True, True]
 
 
@@ -1458,8 +1458,8 @@ def test_a_certificate_is_of_the_loop_that_is_delivered_without_the_draws_of_the
     observed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     task = task_for({}, linear={"f": 1}, own={"p": 2, "f, draw 1": 3}, drawn=("f, draw 1",), observer="eyes")
-    monkeypatch.setattr(_tune, "verify", lambda *settings, **named: (*settings, named))
-    controller, plants, asked, named = _tune._verify_loop(task, "c", observed, None, 2)  # pyright: ignore[reportGeneralTypeIssues]
+    monkeypatch.setattr(_certify, "verify", lambda *settings, **named: (*settings, named))
+    controller, plants, asked, named = _certify._verify_loop(task, "c", observed, None, 2)  # pyright: ignore[reportGeneralTypeIssues]
     assert (controller, plants, asked) == ("c", {"f": 1, "p": 2}, task.asked.certificate)
     assert (named["observer"], named["attempt"]) == ("eyes" if observed else None, 2)
 
@@ -1476,9 +1476,8 @@ def ended(
     failed = [SimpleNamespace(value=value, requirement=bounds[min(k, 1)])
               for k, (holds, value) in enumerate(verified) if not holds]  # fmt: skip
     verification = SimpleNamespace(holds=not failed, failed=failed)
-    certified = _tune._Certified(best, SimpleNamespace(design={}), False, verification)  # pyright: ignore[reportArgumentType]
+    certified = _certify.Certified(best, SimpleNamespace(design={}), False, verification)  # pyright: ignore[reportArgumentType]
     monkeypatch.setattr(_tune, "prepare", lambda _: SimpleNamespace(own=()))
-    monkeypatch.setattr(_tune, "make_observer", lambda *_: None)
     monkeypatch.setattr(_tune, "_relax", lambda found, *_: ("relaxed", found))
     search: Any = SimpleNamespace(task=task, sort_candidates=lambda: [best], dropped={"lqg": "no"}, spent=[1],
                                   earlier=1)  # fmt: skip
@@ -1512,19 +1511,19 @@ def test_loops_are_compared_with_loops_and_an_observer_is_judged_where_there_are
 ) -> None:
     levels = [of_kind("a", 0.5, level, number=k) for k, level in enumerate(("margins", "all", "linear"))]
     search: Any = SimpleNamespace(sort_candidates=lambda: levels)
-    assert _tune._compared(search) == levels[:2]
+    assert _certify.compared_candidates(search) == levels[:2]
     levels[:] = levels[2:]
-    assert _tune._compared(search) == levels
-    monkeypatch.setattr(_tune, "make_observer", lambda _, kind: "eyes" if kind == "mpc" else None)
-    monkeypatch.setattr(_tune, "holds_with_observer", lambda *_: True)
-    monkeypatch.setattr(_tune, "_drawn_in_search", lambda *_: [])
+    assert _certify.compared_candidates(search) == levels
+    monkeypatch.setattr(_certify, "make_observer", lambda _, kind: "eyes" if kind == "mpc" else None)
+    monkeypatch.setattr(_certify, "holds_with_observer", lambda *_: True)
+    monkeypatch.setattr(_certify, "_drawn_in_search", lambda *_: [])
     own_eyes: Any = SimpleNamespace(block=lambda: "seen")
     for own, eyes, kind, observed in (
         ({}, own_eyes, "pi", False), ({"p": 1}, own_eyes, "pi", True), ({"p": 1}, None, "pi", False),
         ({}, own_eyes, "mpc", True),
     ):  # fmt: skip
         task = task_for({}, own=own, observer=eyes, bounds=())
-        assert _tune._observed(task, of_kind(kind, 0.5)) is observed
+        assert _certify._observed(task, of_kind(kind, 0.5)) is observed
 
 
 def test_the_observer_is_over_a_model_with_payloads_if_there_is_one_that_it_takes(
@@ -1550,7 +1549,7 @@ def test_a_search_without_any_result_says_whether_the_budget_or_the_designs_ende
     for dropped, error in (({"pi": "x"}, CheckFailedError), ({"pi": "x", "lqg": "y"}, SettingsError)):
         search: Any = SimpleNamespace(task=task_for({}), sort_candidates=list, dropped=dropped, spaces=spaces)
         with pytest.raises(error, match="pi: x"):
-            _tune._compared(search)
+            _certify.compared_candidates(search)
 
 
 def test_the_rise_that_is_aimed_at_is_the_shortest_asked_or_two_time_constants() -> None:
@@ -1587,7 +1586,7 @@ def test_the_cocontraction_of_loops_is_the_recordings_with_the_heaviest_load(
 
 
 def test_a_search_without_candidates_has_nothing_in_its_way_and_its_defaults_are_those_of_the_command() -> None:
-    assert _tune.active_requirement([], [_bound("sim.rise_s")], tested=False) == (None, None)
+    assert _compare.active_requirement([], [_bound("sim.rise_s")], tested=False) == (None, None)
     defaults = {name: item.default for name, item in inspect.signature(_tune.tune).parameters.items()}
     del defaults["plants"]
     assert defaults == {
@@ -1598,7 +1597,7 @@ def test_a_search_without_candidates_has_nothing_in_its_way_and_its_defaults_are
     assert (options["budget"], options["seed"]) == (160, 0)
 
 
-RELAXED = {"sim.rise_s": _tune.Loosened(0.5, 0.6, 0.7)}
+RELAXED = {"sim.rise_s": _compare.Loosened(0.5, 0.6, 0.7)}
 
 
 def relaxed(monkeypatch: pytest.MonkeyPatch, items: list[Candidate], held: dict[tuple[str, bool], bool], tried: int):
@@ -1617,10 +1616,10 @@ def relaxed(monkeypatch: pytest.MonkeyPatch, items: list[Candidate], held: dict[
         return {} if item.settings.get("margins") and failed else RELAXED
 
     monkeypatch.setattr(_tune, "relaxations", kept)
-    monkeypatch.setattr(_tune, "_verify_loop", verified)
-    monkeypatch.setattr(_tune, "design_candidate", lambda *settings: SimpleNamespace(kind=settings[2], design={}))
-    monkeypatch.setattr(_tune, "prepare", lambda _: None)
-    monkeypatch.setattr(_tune, "_observed", lambda _, item: item.kind == "lqg")
+    monkeypatch.setattr(_certify, "_verify_loop", verified)
+    monkeypatch.setattr(_certify, "design_candidate", lambda *settings: SimpleNamespace(kind=settings[2], design={}))
+    monkeypatch.setattr(_certify, "prepare", lambda _: None)
+    monkeypatch.setattr(_certify, "_observed", lambda _, item: item.kind == "lqg")
     controller = SimpleNamespace(kind=items[0].kind, design={})
     # That of the best may hold where the loops of its search do not.
     first = SimpleNamespace(failed=[items[0].kind], holds=True)
@@ -1647,7 +1646,7 @@ def test_what_is_relaxed_is_verified_again_by_draws_of_its_own(monkeypatch: pyte
     assert found.loosened == RELAXED
     assert found.task.asked.limit("sim.rise_s") == found.verification.task.asked.limit("sim.rise_s") == 0.7
     assert relaxed(monkeypatch, [rising("pi")], {}, 2)[1] == [("pi", True, 3)]
-    monkeypatch.setattr(_tune, "_most_attempts", lambda _: 2)
+    monkeypatch.setattr(_tune, "most_attempts", lambda _: 2)
     assert relaxed(monkeypatch, [rising("pi")], {}, 2)[1] == []  # no draws are left
     # A best that fails in its margins is not verified again.
     assert relaxed(monkeypatch, [rising("pi", margins=True)], {}, 2)[1] == []
@@ -1657,7 +1656,7 @@ def test_where_the_best_fails_in_more_the_best_of_another_kind_is_verified_and_r
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     items = [rising("pi", margins=True), rising("pi"), rising("lqg"), rising("lqg"), rising("mpc")]
-    monkeypatch.setattr(_tune, "_most_attempts", lambda _: 4)
+    monkeypatch.setattr(_tune, "most_attempts", lambda _: 4)
     found, made = relaxed(monkeypatch, items, {("lqg", True): True}, 1)
     # At what was asked first, which tells each metric that fails; never more certificates than a family has draws for.
     assert made == [("lqg", False, 2), ("lqg", True, 3)]

@@ -21,12 +21,13 @@ from softneck.core._kinds import make_settings
 from softneck.plant import NeckParameters
 from softneck.robot import Robot
 from softneck.tuning import task_of, tune
+from softneck.tuning._compare import active_requirement, front
 from softneck.tuning._judge import cases, judged_delay, told_conditions
 from softneck.tuning._requirements import make_tune_requirements
 from softneck.tuning._search import Candidate, _optimiser, in_words, ratio, run_jobs
 from softneck.tuning._space import KINDS_SEARCHED, spaces
 from softneck.tuning._task import _LOG_FORMAT, FILE, Job, Log, Task
-from softneck.tuning._tune import Tuned, active_requirement, front
+from softneck.tuning._tune import Tuned
 from softneck.verification import make_simulation_model
 from softneck.verification._requirements import Requirement
 

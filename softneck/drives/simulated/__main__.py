@@ -15,9 +15,9 @@ import click
 from softneck.core import SettingsError
 from softneck.plant import NeckParameters
 
+from ._axis import STATES
 from ._drives import SimulatedDrives, SimulatedSettings
 from ._neck import SimulatedNeck
-from ._power import STATES
 from ._profiles import PROFILES
 from ._quirks import quirks_of
 from ._server import serve

@@ -8,7 +8,6 @@ from collections import deque
 
 from softneck.core import Vector
 
-from . import _power as power
 from . import _servo_runtime as servo
 from ._profiles import Item, Profile
 from ._quirks import DriveQuirks
@@ -23,6 +22,38 @@ _FOLLOWING_ERROR, _ENABLE_INPUT, _GUARDING = 0x8611, 0x5441, 0x8130
 _MOTION_ERRORS = {_GUARDING: 1 << 0, 0x2340: 1 << 1, _FOLLOWING_ERROR: 1 << 3, 0x2310: 1 << 8, 0x4310: 1 << 11,
                   0x3210: 1 << 12, 0x3220: 1 << 13, _ENABLE_INPUT: 1 << 15}  # fmt: skip
 _LIMIT_CODES = {1.0: 0xFF06, -1.0: 0xFF07}
+
+# The power state machine of a drive (CiA 402-2): states by their status word under the mask 6Fh.
+STATES = {0x00: "NOT_READY", 0x40: "DISABLED", 0x21: "READY", 0x23: "SWITCHED_ON", 0x27: "ENABLED", 0x07: "QUICK_STOP",
+          0x0F: "REACTION", 0x08: "FAULT"}  # fmt: skip
+NOT_READY, SWITCH_ON_DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, REACTION, FAULT = STATES
+
+# Requests of control words: (mask, value, request), first match wins; bit 7 acts by its rising edge.
+_REQUEST_TABLE = (
+    (0x02, 0x00, "disable voltage"),
+    (0x06, 0x02, "quick stop"),
+    (0x07, 0x06, "shutdown"),
+    (0x0F, 0x07, "switch on"),
+    (0x0F, 0x0F, "enable"),
+)
+_TRANSITIONS = {
+    (SWITCH_ON_DISABLED, "shutdown"): READY,
+    (READY, "disable voltage"): SWITCH_ON_DISABLED,
+    (READY, "quick stop"): SWITCH_ON_DISABLED,
+    (READY, "switch on"): SWITCHED_ON,
+    # Through Switched On at once (CiA 402-2, transition 3 followed by 4).
+    (READY, "enable"): ENABLED,
+    (SWITCHED_ON, "disable voltage"): SWITCH_ON_DISABLED,
+    (SWITCHED_ON, "quick stop"): SWITCH_ON_DISABLED,
+    (SWITCHED_ON, "shutdown"): READY,
+    (SWITCHED_ON, "enable"): ENABLED,
+    (ENABLED, "disable voltage"): SWITCH_ON_DISABLED,
+    (ENABLED, "shutdown"): READY,
+    (ENABLED, "switch on"): SWITCHED_ON,
+    (ENABLED, "quick stop"): QUICK_STOP,
+    (QUICK_STOP, "disable voltage"): SWITCH_ON_DISABLED,
+    (QUICK_STOP, "enable"): ENABLED,
+}
 
 
 class Axis:
@@ -81,7 +112,7 @@ class Axis:
         if self.profile.rated_current:
             self.values[(0x6075, 0)] = round(1000.0 * self.profile.rated_current)
         self._default_limits()
-        self.state, self.fault, self.homed = power.SWITCH_ON_DISABLED, 0, False
+        self.state, self.fault, self.homed = SWITCH_ON_DISABLED, 0, False
         self._word = self._stop_then = 0
         self._attained = self._acknowledged = False
         self._limit_told = self._target = 0
@@ -135,7 +166,7 @@ class Axis:
         if len(data) != item.size:
             return WRONG_LENGTH
         value = int.from_bytes(data, "little", signed=item.signed)
-        refused = self.quirks.unwritable(index, value, enabled=self.state == power.ENABLED)
+        refused = self.quirks.unwritable(index, value, enabled=self.state == ENABLED)
         return refused or self.store((index, subindex), value, item)
 
     def store(self, key: tuple[int, int], value: int, item: Item) -> int:
@@ -175,7 +206,7 @@ class Axis:
             m[servo.SERVO_CURRENT_LIMIT] = v[(0x207F, 0)] * 2.0 * self.peak_current / _CURRENT_RANGE
         else:
             m[servo.SERVO_CURRENT_LIMIT] = v[(0x6073, 0)] * v[(0x6075, 0)] / 1e6
-        if self.state == power.ENABLED and m[servo.SERVO_MODE] != v[(0x6060, 0)]:
+        if self.state == ENABLED and m[servo.SERVO_MODE] != v[(0x6060, 0)]:
             self._take_mode()
 
     @property
@@ -188,7 +219,7 @@ class Axis:
         """Return 6041h."""
         m, mode = self.motion, self.values[(0x6060, 0)]
         word = self.state | 0x0200 | 0x0010
-        if self.state != power.QUICK_STOP:
+        if self.state != QUICK_STOP:
             word |= 0x0020 if self.state & 0x04 else 0
         if m[servo.SERVO_AT_LIMIT] != 0.0:
             word |= 0x0800
@@ -196,27 +227,27 @@ class Axis:
             return word | (0x1400 if self._attained else 0)
         if mode == 1 and m[servo.SERVO_DEMAND] == m[servo.SERVO_TARGET]:
             word |= 0x0400
-        if (mode == 8 and self.state == power.ENABLED) or (mode == 1 and self._acknowledged):
+        if (mode == 8 and self.state == ENABLED) or (mode == 1 and self._acknowledged):
             word |= 0x1000
         return word | (0x2000 if m[servo.SERVO_TRIPPED] else 0)
 
     def _shown_mode(self) -> int:
         mode = self.values[(0x6060, 0)]
-        return 0 if mode == 8 and self.profile.late_mode_display and self.state != power.ENABLED else mode
+        return 0 if mode == 8 and self.profile.late_mode_display and self.state != ENABLED else mode
 
     def _control(self, word: int) -> None:
         before, self._word = self._word, word
-        if self.state == power.FAULT:
+        if self.state == FAULT:
             if word & 0x80 and not before & 0x80 and self.enable_input:
                 self.fault = 0
                 self.motion[servo.SERVO_TRIPPED] = 0.0
                 self.emergencies.append((0x0000, 0))
-                self.state = power.SWITCH_ON_DISABLED
+                self.state = SWITCH_ON_DISABLED
             return
-        if self.state == power.REACTION:
+        if self.state == REACTION:
             return
-        self._enter(power.next_state(self.state, word))
-        if self.state == power.ENABLED:
+        self._enter(next_state(self.state, word))
+        if self.state == ENABLED:
             self._mode_bits(word, before)
 
     def _mode_bits(self, word: int, before: int) -> None:
@@ -236,23 +267,23 @@ class Axis:
         if state == self.state:
             return
         before, self.state = self.state, state
-        if state == power.QUICK_STOP:
+        if state == QUICK_STOP:
             option = self.values[(0x605A, 0)]
             if option == 0:
-                self._enter(power.SWITCH_ON_DISABLED)
+                self._enter(SWITCH_ON_DISABLED)
             else:
-                self._stop(power.SWITCH_ON_DISABLED if option in (1, 2) else 0)
-        elif state == power.ENABLED:
+                self._stop(SWITCH_ON_DISABLED if option in (1, 2) else 0)
+        elif state == ENABLED:
             if not self.enable_input:
                 self.trip(_ENABLE_INPUT)
                 return
-            if before != power.QUICK_STOP:
+            if before != QUICK_STOP:
                 self.motion[servo.SERVO_DEMAND] = self.motion[servo.SERVO_POSITION]
                 self.motion[servo.SERVO_DEMAND_SPEED] = 0.0
             self.motion[servo.SERVO_POWER] = 1.0
             self._attained = False
             self._take_mode()
-        elif state != power.REACTION:
+        elif state != REACTION:
             self.motion[servo.SERVO_POWER] = 0.0
 
     def _take_mode(self) -> None:
@@ -269,15 +300,15 @@ class Axis:
 
     def trip(self, code: int) -> None:
         """Enter a fault: report it once, react by 605Eh, and latch it."""
-        if self.state in (power.FAULT, power.REACTION):
+        if self.state in (FAULT, REACTION):
             return
         self.fault = code
         self.emergencies.append((code, 1))
         if self.motion[servo.SERVO_POWER] > 0.5 and self.values[(0x605E, 0)] == 2:
-            self._enter(power.REACTION)
-            self._stop(power.FAULT)
+            self._enter(REACTION)
+            self._stop(FAULT)
         else:
-            self._enter(power.FAULT)
+            self._enter(FAULT)
 
     def connection_lost(self) -> None:
         """Handle a failure of guarding or heartbeat: report it and react by 6007h."""
@@ -287,9 +318,9 @@ class Axis:
             return
         self.emergencies.append((_GUARDING, 0x10))
         if option == 2:
-            self._enter(power.next_state(self.state, 0x00))
-        elif option == 3 and self.state == power.ENABLED:
-            self._enter(power.QUICK_STOP)
+            self._enter(next_state(self.state, 0x00))
+        elif option == 3 and self.state == ENABLED:
+            self._enter(QUICK_STOP)
 
     def watch(self) -> None:
         """Update limits, following error, inputs and the end of stop ramps; called after each cycle of motion."""
@@ -297,7 +328,7 @@ class Axis:
         self._probe()
         if m[servo.SERVO_POWER] < 0.5:
             return
-        if m[servo.SERVO_TRIPPED] and self.state not in (power.FAULT, power.REACTION):
+        if m[servo.SERVO_TRIPPED] and self.state not in (FAULT, REACTION):
             self.trip(_FOLLOWING_ERROR)
         if not self.enable_input:
             self.trip(_ENABLE_INPUT)
@@ -357,3 +388,13 @@ def fields_of(
         keys.append(key)
     packed = struct.Struct(code)
     return (packed, keys) if packed.size <= 8 else None
+
+
+def request(word: int) -> str:
+    """Return the request in control word `word`; "" for none."""
+    return next((name for mask, value, name in _REQUEST_TABLE if word & mask == value), "")
+
+
+def next_state(state: int, word: int) -> int:
+    """Return the state after control word `word`; unchanged without a transition."""
+    return _TRANSITIONS.get((state, request(word)), state)

@@ -16,7 +16,7 @@ from softneck.drives.master._events import RULES
 from softneck.drives.master._limiter import Limiter
 from softneck.drives.master._settings import LimitSettings
 from softneck.drives.master._supervisor import NEXT, Signal
-from softneck.drives.simulated import _power as power
+from softneck.drives.simulated import _axis as power
 
 from ..bench import ENABLED, Bench, Script, T
 

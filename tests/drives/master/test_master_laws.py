@@ -9,7 +9,7 @@ from softneck.drives.master._cia402 import DriveState, Goal, control_word
 from softneck.drives.master._events import Event
 from softneck.drives.master._settings import LimitSettings, WatchSettings
 from softneck.drives.master._watches import Leaky, Patience, Watches
-from softneck.drives.simulated import _power as power
+from softneck.drives.simulated import _axis as power
 
 from ..bench import Bench, T
 
