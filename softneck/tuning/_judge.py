@@ -406,7 +406,7 @@ def loop_curves(
     )
     P = np.column_stack([steps[-1][motor] for motor in task.robot.set_points])
     # A set-point is held until the next sample.
-    rows = np.clip(np.searchsorted(after[-1], time + 1e-9, side="right") - 1, 0, len(P) - 1)
+    rows = np.searchsorted(after[-1], time + 1e-9, side="right") - 1
     found = _step_curves(task, ready, y, P[rows]) | {"reference": [_rounded(shown(reference[-1] - before))]}
     if circles:
         r = np.array([_radius(result, task) for result in circles])
@@ -425,7 +425,7 @@ def linear_curves(task: Task, ready: Ready, controller: Any) -> dict[str, list[f
     half = found.time.size // 2
     # The nominal plant, the first, is moved to the end.
     y = np.array([np.interp(time, found.time[:half], each[:half]) for each in found.angles[0, ::-1]])
-    rows = np.minimum(np.searchsorted(found.time[:half], time + 1e-9, side="right") - 1, half - 1)
+    rows = np.searchsorted(found.time[:half], time + 1e-9, side="right") - 1
     curves = _step_curves(task, ready, shown(y), found.motors[0, 0, rows])
     return _finite_curves(curves | {"reference": [_rounded(float(shown(test.step)))]})
 

@@ -277,7 +277,7 @@ def _relax(found: Tuned, tried: int, files: Mapping[str, tuple[str, str]] | None
         certified = best
         if item is not found.best:
             if tried + 2 > most:
-                break
+                return found
             tried += 1
             progress(0.9, f"verify {item.kind}")
             certified = certify(task, item, files, tried)

@@ -175,6 +175,14 @@ TWO_SEARCHES: dict[str, Any] = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize("wrap", [lambda thing: thing, lambda thing: SimpleNamespace(block=lambda: thing)])
+def test_how_a_plant_keeps_its_numbers_is_no_other_search(task: Task, wrap: Any) -> None:
+    other = block()
+    other.arrays, other.memo = [np.asfortranarray(np.eye(2)), np.array([1.0])], "kept"
+    digests = [digest_of(with_own(task, wrap(thing)), ("pi",), None) for thing in (block(), other)]
+    assert digests[0] == digests[1]
+
+
 @pytest.mark.parametrize("what", TWO_SEARCHES)
 def test_each_number_that_a_search_is_of_makes_it_another(task: Task, what: str) -> None:
     """A log is continued, and designs are kept, by the digest alone."""

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from softneck.cli._tune import command as tune_command
 from softneck.core import KINDS, CheckFailedError, DataError, SettingsError, metric_of, resolve
+from softneck.estimation import LinearNeck
 from softneck.loop import LoopResult, RobotReference
 from softneck.robot import Robot, Scaling
 from softneck.tuning import _certify, _compare, _judge, _search, _tune, task_of
@@ -46,7 +47,8 @@ from softneck.verification._verify import Verdict
 
 from ..design.test_robots import BELLOWS, LEARNED
 from ..order import MEMBERS, check_worst, is_worse
-from ..verification.necks import family, linear_neck
+from ..verification.necks import linear_neck
+from .test_requirements import axis
 
 TS = 0.02
 ALL = metric_names(Robot.preset(), track=True)
@@ -1032,6 +1034,7 @@ def test_a_search_is_led_by_what_it_aims_at_and_its_finals_are_of_each_kind(monk
 
 
 @given(st.lists(st.tuples(st.floats(0.1, 0.9), st.floats(0.0, 2.0)), min_size=1, max_size=6))
+@example([(0.5, 0.0), (0.5, 0.0)])
 def test_final_candidates_that_are_left_out_could_not_win(values: list[tuple[float, float]]) -> None:
     """The best is the same as if all were judged, and so is its value: more loops only add to a cost."""
     search, judged = searching("a", own={"p": 1}), list[Any]()
@@ -1050,6 +1053,8 @@ def test_final_candidates_that_are_left_out_could_not_win(values: list[tuple[flo
         search._judge_finals(items)
     assert min(item.metrics["m"] for item in judged) == all_of_them
     assert judged[0] is items[0]
+    assert all(before < items[0].metrics["m"] for before, item in zip(sorted(b for b, _ in values), items, strict=True)
+               if item in judged[1:])  # fmt: skip
     # Those that are worse than the first before their judgement have none.
     assert all(item.metrics["m"] >= items[0].metrics["m"] for item in items if item not in judged)
 
@@ -1555,8 +1560,11 @@ def test_a_search_without_any_result_says_whether_the_budget_or_the_designs_ende
 def test_the_rise_that_is_aimed_at_is_the_shortest_asked_or_two_time_constants() -> None:
     both = task_for({"require": {"sim.rise_s": {"max": 0.7}, "step.rise_s": {"max": 0.5}}})
     assert _tune._target_rise(both) == 0.5
-    none = task_for({"require": {"sim.rise_s": False}}, linear={"slow": linear_neck(), "fast": family()})
-    assert _tune._target_rise(none) == pytest.approx(2.0 / 5.293)
+    # Of the slower axis of the nominal plant, the first.
+    for one, other in ((9.0, 4.0), (4.0, 9.0)):
+        first, second = (LinearNeck(pitch=axis(one), roll=axis(pole)) for pole in (other, 2.0))
+        none = task_for({"require": {"sim.rise_s": False}}, linear={"a": first, "b": second})
+        assert _tune._target_rise(none) == pytest.approx(2.0 / 4.0)
 
 
 @pytest.mark.parametrize(

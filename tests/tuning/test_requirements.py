@@ -198,11 +198,12 @@ def test_the_defaults_can_be_had() -> None:
     check_feasibility(make_tune_requirements({}), neck())
 
 
-def test_a_rise_is_refused_exactly_where_the_motors_cannot_give_it() -> None:
-    least = least_rise_by_hand(math.radians(15.0))
+@pytest.mark.parametrize(("metric", "size"), [("sim.rise_s", 15.0), ("step.rise_s", 10.0)])
+def test_a_rise_is_refused_exactly_where_the_motors_cannot_give_it(metric: str, size: float) -> None:
+    least = least_rise_by_hand(math.radians(size))
     for factor in (0.95, 1.05):
-        table = {"require": {"sim.rise_s": {"max": least * factor}, "track.circle_rms_deg": False}}
-        asked = make_tune_requirements(table)
+        table = {"require": {"sim.rise_s": False, metric: {"max": least * factor}, "track.circle_rms_deg": False}}
+        asked = make_tune_requirements(table | {"step": {"size_deg": 10.0}})
         if factor > 1.0:
             check_feasibility(asked, neck())
         else:

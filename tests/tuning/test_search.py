@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from softneck.core import KINDS, FileFormatError, OutputFileError, SettingsError, SoftneckError, resolve
 from softneck.core._kinds import make_settings
 from softneck.plant import NeckParameters
-from softneck.robot import Robot
+from softneck.robot import Robot, Scaling
 from softneck.tuning import task_of, tune
 from softneck.tuning._compare import active_requirement, front
 from softneck.tuning._judge import cases, judged_delay, told_conditions
@@ -284,8 +284,12 @@ BOUNDS = (Requirement("sim.rise_s", "max", 0.4, True), Requirement("sim.overshoo
 
 def test_the_front_is_what_no_other_beats() -> None:
     rng = np.random.default_rng(1)
-    items = [candidate(a=x, axes__gain_margin=y) for x, y in rng.integers(0, 6, (40, 2)).astype(float)]
+    items = [candidate(a=x, b=-y, axes__gain_margin=y) for x, y in rng.integers(0, 6, (40, 2)).astype(float)]
     kept = front(items, ["a", "axes.gain_margin"])
+    # It begins with the best in the first objective.
+    for names in (["a", "b"], ["b", "a"]):
+        firsts = [item.metrics[names[0]] for item in front(items, names)]
+        assert firsts == sorted(item.metrics[names[0]] for item in kept)
 
     def beats(one: Candidate, other: Candidate) -> bool:
         p, q = ((item.metrics["a"], -item.metrics["axes.gain_margin"]) for item in (one, other))
@@ -507,10 +511,11 @@ SEARCHED = {
 
 
 @pytest.mark.parametrize("kind", SEARCHED)
-@pytest.mark.parametrize("least", [0.0, 0.3, 9.0])
-def test_what_is_searched_of_a_kind_has_its_range_and_its_start(kind: str, least: float) -> None:
-    """Speeds are in parts of the rise that is asked, and no shorter than the motors allow."""
-    robot, rise = Robot.preset("neck"), 0.5
+@pytest.mark.parametrize(("least", "preset"), [(0.0, "neck"), (0.3, "finger"), (9.0, "neck")])
+def test_what_is_searched_of_a_kind_has_its_range_and_its_start(kind: str, least: float, preset: str) -> None:
+    """Speeds are in parts of the rise that is asked, and no shorter than the motors allow; leads in their unit."""
+    robot, rise = Robot.preset(preset), 0.5
+    unit = Scaling.of(robot).motor_unit
     (space,) = spaces((kind,), rise=rise, cocontraction=0.7, robot=robot, least=least)
     found = [(item.name, item.low, item.high, item.start) for item in space.dimensions]
     short = min(least, rise)
@@ -519,7 +524,7 @@ def test_what_is_searched_of_a_kind_has_its_range_and_its_start(kind: str, least
         [("reference_time", 0.05 * rise, 0.6 * rise, 0.25 * rise), ("lead", 0.2, 2.5, 1.0)] if linear
         else [("rise_s", max(0.3 * rise, 1.03 * short), 1.2 * rise, max(0.42 * rise, 1.03**2 * short))]
     )  # fmt: skip
-    ahead = [("lead_limit", 0.4, 2.0, 0.8)] if kind in ("mpc", "nmpc") else []
+    ahead = [("lead_limit", 0.4 * unit, 2.0 * unit, 0.8 * unit)] if kind in ("mpc", "nmpc") else []
     assert [row[0] for row in found] == [row[0] for row in (*speed, *SEARCHED[kind], *ahead)]
     for row, expected in zip(found, (*speed, *SEARCHED[kind], *ahead), strict=True):
         assert row[1:] == pytest.approx(expected[1:])
@@ -534,7 +539,7 @@ def test_what_is_searched_of_a_kind_has_its_range_and_its_start(kind: str, least
     pulls = {"mpc": {}, "nmpc": {"minimum_tautness": 0.7}}.get(kind, {"least_cocontraction": 0.7})
     assert {key: value for key, value in space.fixed.items() if key != "lead_limit"} == pulls
     assert ("lead_limit" in space.fixed) is (not ahead)
-    assert space.fixed.get("lead_limit", 0.6) == pytest.approx(0.6)
+    assert space.fixed.get("lead_limit", 0.6 * unit) == pytest.approx(0.6 * unit)
     settings = space.settings(space.start)
     if linear:
         assert settings["reference_time"] == pytest.approx([0.25 * rise, 1.0], rel=1e-3)
