@@ -20,8 +20,8 @@ from pathlib import Path
 
 from ._errors import FileFormatError, OutputFileError, SettingsError
 
-# [bytes] Largest TOML file that people write (the reader takes 2 s for 4 MB); largest JSON file that commands write, or
-# EDS.
+# [bytes] Largest TOML file that people write (the reader takes 2 s for 4 MB); largest JSON file that commands
+# write.
 MOST_TOML, MOST_JSON = 2**20, 2**24
 # [bytes] Largest log on the disk: a day of 12 columns at 100 Hz is 1 GB of text. Largest unpacked size of an archive.
 MOST_LOG, MOST_UNPACKED = 2**30, 2 * 2**30

@@ -12,14 +12,13 @@ import time
 import zlib
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import can
 import canopen
 import pytest
+from canopen.objectdictionary import ODRecord, ODVariable
 
-from softneck.drives.bus import _sdo
 from softneck.drives.bus._link import CanLink
 from softneck.drives.bus._sdo import NUMBERS, Objects, SdoError
 from softneck.drives.running._preflight import scan
@@ -28,11 +27,30 @@ from softneck.drives.simulated._profiles import PROFILES
 from softneck.drives.simulated._quirks import DriveQuirks
 from softneck.plant import NeckParameters
 
-EDS = Path(_sdo.__file__).parent / "eds"
+# Size and sign -> type number of CiA 301.
+TYPES = {(0, False): 0x9, (1, False): 0x5, (2, False): 0x6, (4, False): 0x7, (1, True): 0x2, (2, True): 0x3,
+         (4, True): 0x4}  # fmt: skip
 VCAN = pytest.mark.skipif(
     "vcan0" not in {name for _, name in socket.if_nameindex()}, reason="no vcan0 in this network (make nightly-can has)"
 )
 BUSES = ["virtual", "udp_multicast", pytest.param("socketcan", marks=VCAN)]
+
+
+def dictionary_of(profile: str) -> canopen.ObjectDictionary:
+    """Return the objects of our drives as theirs take them."""
+    found: Any = canopen.ObjectDictionary()
+    items = PROFILES[profile]().items
+    for (index, subindex), item in items.items():
+        variable: Any = ODVariable(f"{index:04X}h:{subindex}", index, subindex)
+        variable.data_type, variable.access_type = TYPES[item.size, item.signed], "rw" if item.writable else "ro"
+        variable.default = item.start if item.size else item.text
+        if (index, 1) not in items:
+            found.add_object(variable)
+            continue
+        if index not in found:
+            found.add_object(ODRecord(f"{index:04X}h", index))
+        found[index].add_member(variable)
+    return found
 
 
 def opened(interface: str, name: str) -> can.BusABC:
@@ -100,7 +118,7 @@ def test_a_foreign_master_reads_every_object_of_our_drives(
     foreign_master: tuple[SimulatedNeck, canopen.Network],
 ) -> None:
     neck, network = foreign_master
-    node: Any = network.add_node(2, str(EDS / "ipos2015.eds"))
+    node: Any = network.add_node(2, dictionary_of("ipos2015"))
     axis = neck.drives[1].axis
     for (index, subindex), item in PROFILES["ipos2015"]().items.items():
         data = node.sdo.upload(index, subindex)
@@ -117,7 +135,7 @@ def test_a_foreign_master_leads_our_drive_through_its_states(
     foreign_master: tuple[SimulatedNeck, canopen.Network],
 ) -> None:
     neck, network = foreign_master
-    node: Any = network.add_node(1, str(EDS / "ipos2015.eds"))
+    node: Any = network.add_node(1, dictionary_of("ipos2015"))
     drive = neck.drives[0]
     # Not canopen's `wait_for_bootup`: it forgets what came before it was called.
     heard: list[int] = []
@@ -153,12 +171,12 @@ def test_our_master_finds_foreign_slaves_and_writes_and_reads_all_their_objects(
 ) -> None:
     """Their slaves hold whatever is written: what we read back is what we wrote, of every size and sign."""
     need_periodic(interface)
-    name, eds = request.node.name, str(EDS / f"{profile}.eds")
+    name, objects_held = request.node.name, dictionary_of(profile)
     slaves = canopen.Network()
     slaves.bus = opened(interface, name)
     slaves.notifier = can.Notifier(slaves.bus, slaves.listeners, 0.1)
     try:
-        nodes: list[Any] = [slaves.create_node(number, eds) for number in (1, 2, 3)]
+        nodes: list[Any] = [slaves.create_node(number, objects_held) for number in (1, 2, 3)]
         for node in nodes:
             node.sdo[0x1000].raw = 0x00020192
             node.sdo[0x1008].raw = f"a slave that others wrote {node.id}"

@@ -158,7 +158,6 @@ xmlns:ssc="http://ssp-standard.org/SSP1/SystemStructureCommon" name="a" version=
 <Master stepSize="0.02" order="jacobi"/></ssc:Annotation></ssd:Annotations></ssd:SystemStructureDescription>"""
 
 
-# All of what an EDS may say, but not the objects that a run needs.
 def sheet(path: Path) -> None:
     """As the reader, but that a fork tries a file first: a process of its own would take most of the time."""
     with mock.patch.object(_sheets, "_try", tried):

@@ -1,4 +1,4 @@
-"""The two kinds of simulated drives: the objects of their EDS files, and further differences.
+"""The two kinds of simulated drives: their objects (`objects.csv`, types as in `struct`), and further differences.
 
 `ipos2015` follows Technosoft's manual P091.063 (2015); `ds402` is a drive after CiA 301/402 with heartbeat consumer.
 Neither has been compared with a real drive.
@@ -6,13 +6,13 @@ Neither has been compared with a real drive.
 
 from __future__ import annotations
 
+import csv
 import functools
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
 
-_EDS = Path(__file__).parents[1] / "bus" / "eds"
 Key = tuple[int, int]
 
 
@@ -66,21 +66,15 @@ class Profile:
 
 @functools.cache
 def _objects(profile: str) -> dict[Key, Item]:
-    """Return the objects of an EDS file; COB-IDs are those of node 0, to which a drive adds its number."""
-    from canopen.objectdictionary import ODVariable, import_od
-    from canopen.objectdictionary.datatypes import SIGNED_TYPES, VISIBLE_STRING
-
+    """Return the objects of a profile; COB-IDs are those of node 0, to which a drive adds its number."""
     items: dict[Key, Item] = {}
-    for entry in import_od(str(_EDS / f"{profile}.eds"), 0).values():
-        for variable in (entry,) if isinstance(entry, ODVariable) else entry.values():
-            text, default = variable.data_type == VISIBLE_STRING, cast("Any", variable.default)
-            items[variable.index, variable.subindex] = Item(
-                start=0 if text else default,
-                size=0 if text else len(variable) // 8,
-                signed=variable.data_type in SIGNED_TYPES,
-                writable=variable.writable,
-                text=default if text else "",
-            )
+    with Path(__file__).with_name("objects.csv").open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            value, kind, key = row[profile], row["type"], (int(row["index"], 16), int(row["subindex"]))
+            if kind == "text":
+                items[key] = Item(size=0, writable=False, text=value)
+            elif value:  # else drives of this profile lack it
+                items[key] = Item(int(value, 0), struct.calcsize(kind), kind.islower(), row["access"] == "rw")
     return items
 
 
