@@ -26,6 +26,7 @@ from .varying._adaptive import VaryingController as VaryingController
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
 from ._design import linear_plant as linear_plant
+from .linear._axis_loop import grid_response as grid_response
 from .linear._axis_loop import least_rise as least_rise
 from .linear._controller import assumed_lines as assumed_lines
 from .linear._margins import LoopMargins as LoopMargins

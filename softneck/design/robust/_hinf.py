@@ -11,7 +11,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_between, require_positive
 
-from ..linear._axis_loop import error_feedback
+from ..linear._axis_loop import error_feedback, grid_response
 from ..linear._settings import AxisDesign, AxisSettings
 from ..plants._uncertain import UncertainAxis
 from ._weights import makeweight, to_continuous, to_discrete, weight_image
@@ -143,9 +143,9 @@ def _verify_norm(closed: Any, bound: float) -> float:
             "control effort more (W2), or build further `above` gamma."
         )
     A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (closed.A, closed.B, closed.C, closed.D))
-    s = 1j * np.geomspace(1e-4, 1e5, 400)[:, None, None]
-    response = C @ np.linalg.solve(s * np.eye(len(A)) - A, np.broadcast_to(B, (len(s), *B.shape))) + D
-    size = float(np.linalg.norm(response, 2, axis=(1, 2)).max())
+    response = grid_response(A, B, C, D, 1j * np.geomspace(1e-4, 1e5, 400))
+    # Of a single row or column both norms are one.
+    size = float(np.linalg.norm(response, 2 if min(D.shape) > 1 else None, axis=(1, 2)).max())
     if size > (1.0 + _NORM_TOLERANCE) * bound:
         raise SettingsError(f"the result has a norm of {size:.4g}, beyond {bound:.4g}: scale the weights.")
     return size
@@ -230,22 +230,43 @@ def least_gamma(plant: Partition) -> float:
     Raises:
         SettingsError: none up to 1e8.
     """
-    solve, low, high = _riccati_pair(plant), 0.0, 1.0
-    while solve(high) is None:
+    solve, lost, kept, sizes = _riccati_pair(plant), 0.0, math.inf, dict[float, float]()
+
+    def holds(gamma: float) -> bool:
+        """Return whether a controller exists: it does above a gamma that has one, and not below one without."""
+        nonlocal lost, kept
+        if lost < gamma < kept:
+            found = solve(gamma)
+            if found is None:
+                lost = gamma
+            else:
+                kept, sizes[gamma * gamma] = gamma, float(np.abs(found[0]).max(initial=0.0))
+        return gamma >= kept
+
+    low, high = 0.0, 1.0
+    while not holds(high):
         low, high = high, 4.0 * high
         if high > _MAX_GAMMA:
             raise SettingsError(
                 "no controller exists for any gamma: the plant cannot be stabilised, or a weight is not stable."
             )
-    while high - low > _GAMMA_TOLERANCE * high:
+    while high - low > _GAMMA_TOLERANCE * high and high >= 1e-8:
+        if len(sizes) == 3:
+            # Both sides of where X is infinite: what is halved afterwards is known.
+            least = _pole(*sizes.items())
+            sizes.clear()
+            for factor in (1.0 + 0.1 * _GAMMA_TOLERANCE, 1.0 - 0.1 * _GAMMA_TOLERANCE):
+                holds(factor * math.sqrt(max(least, 0.0)))
         middle = 0.5 * (low + high) if low > 0.0 else 0.25 * high
-        if solve(middle) is None:
-            low = middle
-        else:
-            high = middle
-        if high < 1e-8:
-            break
+        low, high = (low, middle) if holds(middle) else (middle, high)
     return high
+
+
+def _pole(*points: tuple[float, float]) -> float:
+    """Return the pole p of `a + b/(x - p)` through three points."""
+    (x0, y0), (x1, y1), (x2, y2) = points
+    ratio = (y0 - y1) * (x2 - x1) / ((y1 - y2) * (x1 - x0)) if y1 != y2 else 1.0
+    return (ratio * x0 - x2) / (ratio - 1.0) if ratio != 1.0 else 0.0
 
 
 def _riccati_pair(plant: Partition) -> Callable[[float], tuple[Matrix, Matrix, Matrix, Matrix] | None]:
@@ -259,7 +280,9 @@ def _riccati_pair(plant: Partition) -> Callable[[float], tuple[Matrix, Matrix, M
     B, C = np.hstack([B1, plant.B2]), np.vstack([C1, plant.C2])
     D_row, D_column = _direct(plant)
     row, column, Q, P = D_row.T @ D_row, D_column @ D_column.T, C1.T @ C1, B1 @ B1.T
-    cross, other = C1.T @ D_row, B1 @ D_column.T
+    cross, other, still = C1.T @ D_row, B1 @ D_column.T, np.zeros_like(A)
+    # Where the measurement tells the whole disturbance, nothing is to be estimated.
+    quiet = m1 == p2 and float(np.linalg.eigvals(A - B1 @ plant.C2).real.max(initial=-1.0)) < 0.0
 
     def solve(gamma: float) -> tuple[Matrix, Matrix, Matrix, Matrix] | None:
         if gamma <= least:
@@ -268,7 +291,7 @@ def _riccati_pair(plant: Partition) -> Callable[[float], tuple[Matrix, Matrix, M
         R[:m1, :m1] -= g2 * np.eye(m1)
         S[:p1, :p1] -= g2 * np.eye(p1)
         X = _riccati(A, B, Q, R, cross)
-        Y = None if X is None else _riccati(A.T, C.T, P, S, other)
+        Y = None if X is None else still if quiet else _riccati(A.T, C.T, P, S, other)
         if X is None or Y is None or np.abs(np.linalg.eigvals(X @ Y)).max(initial=0.0) >= g2:
             return None
         return X, Y, R, S
