@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
+from types import MappingProxyType
 from typing import Any
 
 from softneck.core import (
@@ -26,8 +27,9 @@ from softneck.verification import (
     verify,
 )
 
-from ._compare import relaxations
+from ._compare import Loosened, relaxations
 from ._judge import LEVELS, design_candidate, keep_worse, loop_of, make_observer, prepare, search_draws
+from ._requirements import relax_limits
 from ._search import Candidate, Search, best_of_kinds, ratio
 from ._task import MARGINS, Log, Task
 
@@ -46,12 +48,16 @@ _SLOWER = 1.1
 
 @dataclass(frozen=True, slots=True)
 class Certified:
-    """A candidate with its controller, whether its loop has the observer, and the verification of that loop."""
+    """A candidate with its controller, whether its loop has the observer, and the verification of that loop.
+
+    `kept`: defaults that the candidate does not meet in its search; it is verified with those that it meets.
+    """
 
     item: Candidate
     controller: Any
     observed: bool
     verification: Verification
+    kept: Mapping[str, Loosened] = field(default_factory=dict)
 
 
 def certify_search(
@@ -148,7 +154,7 @@ def _verify_best(
     promising = [item for item in compared if search.cost(item) <= 1.0][:_MAX_VERIFICATIONS] or compared[:1]
     for number, item in zip(range(tried + 1, most_attempts(search.task) + 1), promising, strict=False):
         progress((number - tried - 1) / len(promising), f"verify {item.kind}")
-        found.append(certify(search.task, item, files, number))
+        found.append(certify(search.task, item, files, number, relaxations(item, (), search.task.asked)))
         if found[-1].verification.holds:
             return found[-1], number
     return found[0], tried + len(found)
@@ -165,11 +171,21 @@ def compared_candidates(search: Search) -> list[Candidate]:
     return [item for item in ranked if LEVELS.index(item.level) >= 1] or ranked
 
 
-def certify(task: Task, item: Candidate, files: Mapping[str, tuple[str, str]] | None, attempt: int) -> Certified:
+def certify(
+    task: Task, item: Candidate, files: Mapping[str, tuple[str, str]] | None, attempt: int,
+    kept: Mapping[str, Loosened] = MappingProxyType({}),
+) -> Certified:  # fmt: skip
     """Return the verification of a candidate's loop, with the observer where its steps hold with it."""
     controller = design_candidate(task, prepare(task), item.kind, item.settings)
     observed = _observed(task, item)
-    return Certified(item, controller, observed, _verify_loop(task, controller, observed, files, attempt))
+    verification = _verify_loop(relaxed(task, kept), controller, observed, files, attempt)
+    return Certified(item, controller, observed, verification, kept)
+
+
+def relaxed(task: Task, kept: Mapping[str, Loosened]) -> Task:
+    """Return the task with the limits that a candidate meets."""
+    limits = {metric: one.limit for metric, one in kept.items()}
+    return replace(task, asked=relax_limits(task.asked, limits)) if limits else task
 
 
 def certify_again(task: Task, made: Certified, files: Mapping[str, tuple[str, str]] | None, attempt: int) -> Certified:

@@ -106,7 +106,8 @@ def relaxations(item: Candidate, failed: Sequence[Verdict], asked: TuneRequireme
 
     Empty if a margin or a stated requirement fails, was not computed, or is missed by more than a factor of 2.
     """
-    broken = {verdict.requirement: verdict.value for verdict in failed}
+    asked_for = {(b.metric, b.bound): b for b in asked.bounds}  # a verdict may be of a relaxed limit
+    broken = {asked_for.get((v.requirement.metric, v.requirement.bound), v.requirement): v.value for v in failed}
     looped = [bound for bound in asked.bounds if bound.metric.startswith(("sim.", "track."))]
     for bound in looped:  # `verify` has no loops with noise
         seen = item.metrics.get(bound.metric)

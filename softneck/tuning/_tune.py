@@ -31,7 +31,15 @@ from softneck.verification import (
     with_robot,
 )
 
-from ._certify import Certified, certify, certify_again, certify_search, compared_candidates, most_attempts
+from ._certify import (
+    Certified,
+    certify,
+    certify_again,
+    certify_search,
+    compared_candidates,
+    most_attempts,
+    relaxed,
+)
 from ._compare import Loosened, active_requirement, front, objectives, relaxations
 from ._judge import LEVELS, prepare, told_conditions
 from ._requirements import (
@@ -42,7 +50,6 @@ from ._requirements import (
     fastest_rise,
     make_tune_requirements,
     read_tune_requirements,
-    relax_limits,
 )
 from ._search import Candidate, Search
 from ._space import KINDS_SEARCHED, UNCERTIFIED, spaces
@@ -262,41 +269,41 @@ def _make_result(
         candidates=compared, front=front(compared, names), objectives=names, binding=stuck, nearest=nearest,
         evaluations=search.earlier + len(search.spent), dropped=search.dropped, task=task,
     )  # fmt: skip
-    return found if holds or not closed else _relax(found, tried, files, progress)
+    return found if holds or not closed else _relax(found, certified, tried, files, progress)
 
 
-def _relax(found: Tuned, tried: int, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
+def _relax(
+    found: Tuned, best: Certified, tried: int, files: Mapping[str, tuple[str, str]] | None, progress: Progress
+) -> Tuned:
     """Return the result with defaults of speed and precision relaxed to those of a candidate, if all others hold.
 
     Candidates are the best, then the best of each other kind that the search has failed in nothing else. Stated
     requirements and stability margins are not relaxed. Each verification has draws that none of the `tried` has seen.
     """
     task, most = found.task, most_attempts(found.task)
-    best = Certified(found.best, found.controller, found.observed, found.verification)
     for item in _relaxable(found):
-        certified = best
+        certified, kept = best, best.kept
         if item is not found.best:
             if tried + 2 > most:
-                return found
+                break
             tried += 1
             progress(0.9, f"verify {item.kind}")
             certified = certify(task, item, files, tried)
-        kept = relaxations(item, certified.verification.failed, task.asked)
-        asked = task.asked
-        if item is found.best and (not kept or tried >= most):
-            continue
-        if kept:
-            tried += 1
-            progress(0.9, "verify what holds")
-            asked = relax_limits(asked, {metric: one.limit for metric, one in kept.items()})
-            certified = certify_again(replace(task, asked=asked), certified, files, tried)
+        if certified is not best or not (kept and best.verification.holds):
+            kept = relaxations(item, certified.verification.failed, task.asked)
+            if item is found.best and (not kept or tried >= most):
+                continue
+            if kept:
+                tried += 1
+                progress(0.9, "verify what holds")
+                certified = certify_again(relaxed(task, kept), certified, files, tried)
         if certified.verification.holds:
             return replace(
                 found, best=item, controller=certified.controller, observed=certified.observed, loosened=kept,
                 assumed=_assumed(certified.controller), verification=certified.verification, holds=True,
-                task=replace(task, asked=asked),
+                task=relaxed(task, kept),
             )  # fmt: skip
-    return found
+    return replace(found, verification=certify_again(task, best, files, tried).verification) if best.kept else found
 
 
 def _relaxable(found: Tuned) -> list[Candidate]:

@@ -810,7 +810,10 @@ def test_curves_stay_until_a_later_level_has_some_and_an_error_changes_nothing_e
 def searching(kinds: str = "abcdefg", budget: int = 20, **more: Any) -> Search:
     spaces: Any = [SimpleNamespace(kind=kind) for kind in kinds]
     bounds = (Requirement("m", "max", 1.0, True),)
-    task: Any = SimpleNamespace(bounds=bounds, aims=bounds, tested=False, seed=0, **{"drawn": (), **more})
+    asked = SimpleNamespace(bounds=bounds, stated=frozenset())
+    task: Any = SimpleNamespace(
+        bounds=bounds, aims=bounds, tested=False, seed=0, **{"drawn": (), "asked": asked, **more}
+    )
     return Search(task, spaces, None, None, budget, lambda *_: None)  # pyright: ignore[reportArgumentType]
 
 
@@ -1310,7 +1313,7 @@ def resumable(monkeypatch: pytest.MonkeyPatch, values: dict[str, float], *, foun
     search.spent = {1, 2, 3}
     verified: list[int] = []
 
-    def certify(_: Any, item: Any, __: Any, attempt: int) -> Any:
+    def certify(_: Any, item: Any, __: Any, attempt: int, ___: Any) -> Any:
         verified.append(attempt)
         fine = attempt >= holds
         return _certify.Certified(item, "c", False, SimpleNamespace(  # pyright: ignore[reportArgumentType]
@@ -1608,8 +1611,14 @@ def test_a_search_without_candidates_has_nothing_in_its_way_and_its_defaults_are
 RELAXED = {"sim.rise_s": _compare.Loosened(0.5, 0.6, 0.7)}
 
 
-def relaxed(monkeypatch: pytest.MonkeyPatch, items: list[Candidate], held: dict[tuple[str, bool], bool], tried: int):
-    """Return the result of `_relax` and its certificates (kind, relaxed, attempt); `held` are those that hold."""
+def relaxed(
+    monkeypatch: pytest.MonkeyPatch, items: list[Candidate], held: dict[tuple[str, bool], bool], tried: int, *,
+    before: dict[str, Any] | None = None, holds: bool = True,
+):  # fmt: skip
+    """Return the result of `_relax` and its certificates (kind, relaxed, attempt); `held` are those that hold.
+
+    `before`: defaults that the first certificate had relaxed; `holds`: whether it does.
+    """
     asked = make_tune_requirements({})
     task = replace(task_of({"n": linear_neck()}, {}, 0), asked=asked)
     made: list[tuple[str, bool, int]] = []
@@ -1630,15 +1639,16 @@ def relaxed(monkeypatch: pytest.MonkeyPatch, items: list[Candidate], held: dict[
     monkeypatch.setattr(_certify, "_observed", lambda _, item: item.kind == "lqg")
     controller = SimpleNamespace(kind=items[0].kind, design={})
     # That of the best may hold where the loops of its search do not.
-    first = SimpleNamespace(failed=[items[0].kind], holds=True)
+    first = SimpleNamespace(failed=[items[0].kind], holds=holds, task=_certify.relaxed(task, before or {}))
     found: Any = _Found(task, items[0], first, candidates=tuple(items), controller=controller)
     done: list[float] = []
-    again: Any = _tune._relax(found, tried, None, lambda share, _: done.append(share))
+    best: Any = _certify.Certified(items[0], controller, False, first, before or {})  # pyright: ignore[reportArgumentType]
+    again: Any = _tune._relax(found, best, tried, None, lambda share, _: done.append(share))
     # Of the last tenth of the bar of `tune`.
     assert done == sorted(done)
     assert all(0.0 <= share <= 1.0 for share in done)
-    assert again.holds is any(held.get((kind, wide)) for kind, wide, _ in made)
-    if not again.holds:
+    assert again.holds is (any(held.get((kind, wide)) for kind, wide, _ in made) or bool(before and holds))
+    if not again.holds and before is None:
         assert again is found
     return again, made
 
@@ -1658,6 +1668,45 @@ def test_what_is_relaxed_is_verified_again_by_draws_of_its_own(monkeypatch: pyte
     assert relaxed(monkeypatch, [rising("pi")], {}, 2)[1] == []  # no draws are left
     # A best that fails in its margins is not verified again.
     assert relaxed(monkeypatch, [rising("pi", margins=True)], {}, 2)[1] == []
+
+
+def test_what_its_search_relaxed_is_verified_once_and_told_as_asked_where_nothing_holds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found, made = relaxed(monkeypatch, [rising("pi")], {}, 1, before=RELAXED)
+    assert made == []
+    assert found.loosened == RELAXED
+    assert found.task.asked.limit("sim.rise_s") == found.verification.task.asked.limit("sim.rise_s") == 0.7
+    # A certificate that fails with them is relaxed by its own values, by draws of its own.
+    found, made = relaxed(monkeypatch, [rising("pi")], {("pi", True): True}, 1, before=RELAXED, holds=False)
+    assert (found.loosened, made) == (RELAXED, [("pi", True, 2)])
+    for item in (rising("pi"), rising("pi", margins=True)):
+        found, made = relaxed(monkeypatch, [item], {}, 1, before=RELAXED, holds=False)
+        assert made[-1][:2] == ("pi", False)
+        assert found.verification.task.asked.limit("sim.rise_s") != 0.7
+        assert found.loosened is None
+
+
+def test_the_best_is_verified_with_the_defaults_that_it_meets_in_its_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    task = replace(task_of({"n": linear_neck()}, {}, 0), asked=make_tune_requirements({}))
+    limit = task.asked.limit("sim.rise_s")
+    assert limit is not None
+    monkeypatch.setattr(_certify, "design_candidate", lambda *_: SimpleNamespace(kind="pi", design={}))
+    monkeypatch.setattr(_certify, "prepare", lambda _: None)
+    monkeypatch.setattr(_certify, "_observed", lambda *_: False)
+    monkeypatch.setattr(_certify, "_verify_loop", lambda task, *_: SimpleNamespace(holds=True, task=task))
+    for factor, wider in ((1.0, {}), (1.4, {"sim.rise_s"}), (2.4, {})):
+        search: Any = SimpleNamespace(
+            task=task, sort_candidates=lambda f=factor: [rising("pi", f * limit)], cost=lambda _: 9.0
+        )
+        certified, tried = _certify._verify_best(search, 0, None, lambda *_: None)
+        seen: Any = certified.verification
+        assert (tried, certified.kept.keys()) == (1, wider or set())
+        assert (seen.task.asked.limit("sim.rise_s") > limit) is bool(wider)
+    # What a relaxed certificate fails is relaxed from the limit that was asked, to the worse of both values.
+    failed = [Verdict(Requirement("sim.rise_s", "max", 1.5 * limit, True), 1.6 * limit, False, {})]
+    one = _compare.relaxations(rising("pi", 1.4 * limit), failed, task.asked)["sim.rise_s"]
+    assert (one.default, one.reached) == (limit, pytest.approx(1.6 * limit))
 
 
 def test_where_the_best_fails_in_more_the_best_of_another_kind_is_verified_and_relaxed(
