@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
 import json
 import os
@@ -12,15 +11,13 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
 import click
 
-import softneck
 from softneck.core import (
     MOST_JSON,
     CheckFailedError,
@@ -31,14 +28,12 @@ from softneck.core import (
     SoftneckError,
     atomic_write,
     file_hash,
-    load,
     settings_text,
 )
-from softneck.robot import Robot
-from softneck.runtime import cache_folder
 
 from ..shared._console import note
-from ._plan import FAMILY, PI, STAGES, Step, Unmet, linear_model, nonlinear_model
+from . import _compile_ahead
+from ._plan import STAGES, Step, Unmet
 
 #: In the folder: finished steps with their inputs, commands and results.
 FILE = "start.json"
@@ -94,8 +89,8 @@ class ProjectRun:
         if not kept:
             for other in step.beside:
                 self._begin(other)
-            if step.compiles and _core_count() > 1 and not _compiled_before().is_file():
-                code = f"from {__name__} import compile_ahead; compile_ahead{step.compiles!r}"
+            if step.compiles and _core_count() > 1 and not _compile_ahead.compiled_before().is_file():
+                code = f"from {_compile_ahead.__name__} import compile_ahead; compile_ahead{step.compiles!r}"
                 self.begun["compile ahead"] = _Process.of(["-c", code])
             begun = bool(same and entry and not entry.get("ended"))
             self.done[step.key] = {
@@ -212,47 +207,6 @@ class _Process:
         """Close the files with what it said."""
         for stream in self.said:
             stream.close()
-
-
-def compile_ahead(*recordings: str) -> None:
-    """Compile what the steps after the models call, in a process that no step waits for, with the lowest priority.
-
-    Run are an observer and the loops of one controller, over the model of the draws and over that of the loops, when
-    they are there; the steps then load the functions from the cache.
-    """
-    from softneck import estimation, signals, tuning
-
-    getattr(os, "nice", int)(19)
-    family = _await(FAMILY)
-    observer = estimation.KalmanSettings().design(family)
-    fitted = estimation.fit_observer(observer, [signals.read_recording(name) for name in recordings], set())
-    estimation.consistency(fitted.observer, signals.read_recording(recordings[0]))
-    bare = replace(family, draws=None)  # with draws, margins would be those of 59
-    for model in [] if family.draws is None else [family.draws.model, None]:
-        if model is None:
-            _await(PI)
-        task = tuning.task_of([bare, model or load(nonlinear_model() or linear_model())], None, 0)
-        for level in reversed(tuning.LEVELS):  # margins first: the search needs their loops last
-            tuning.judge_candidate(task, "pi", {}, level)
-    _compiled_before().touch()
-
-
-def _await(name: str) -> Any:
-    """Return the content of a file when it is there; end if the process that began this one ended before."""
-    parent = os.getppid()
-    while not Path(name).is_file():
-        time.sleep(0.2)
-        if os.getppid() != parent:
-            sys.exit(1)
-    return load(name)
-
-
-def _compiled_before() -> Path:
-    """Return a file that is there if a run for as many motors and outputs has compiled these runtimes."""
-    robot = Robot.read("robot.toml")
-    content = [path.read_bytes() for path in sorted(Path(softneck.__file__).parent.rglob("*_runtime.py"))]
-    sizes = f"{len(robot.motors.names)}_{len(robot.outputs.names)}"
-    return cache_folder() / f"start_{sizes}_{hashlib.sha256(b''.join(content)).hexdigest()[:16]}"
 
 
 def _core_count() -> int:

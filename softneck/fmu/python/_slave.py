@@ -22,9 +22,14 @@ from typing import Any
 import numpy as np
 from pythonfmu.fmi2slave import Fmi2Slave
 
-from ._runtime_names import initialise, state_size, step
 from ._slave_compiled import _FMU_SWITCH, _fmu_compiled_step, _fmu_print
 from ._slave_exit import _fmu_release_at_exit
+
+# Of the runtime, whose text stands before this one in an FMU; pyright checks them.
+# ruff: noqa: F821
+state_size: Callable[..., int]
+initialise: Callable[..., None]
+step: Callable[..., None]
 
 # Tolerance as a share of the sample time: hosts sum up their time, and 1e6 steps of 2 ms are off by 1e-7 s at most.
 _FMU_SAME_TIME = 1e-4

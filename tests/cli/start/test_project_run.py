@@ -19,7 +19,7 @@ import pandas as pd
 import pytest
 
 import softneck
-from softneck.cli.start import _plan, _project_run, _start
+from softneck.cli.start import _compile_ahead, _plan, _project_run, _start
 from softneck.core import CheckFailedError, SettingsError
 from softneck.robot import Robot
 
@@ -180,12 +180,12 @@ def test_functions_are_compiled_ahead_on_another_core_once_and_no_longer_than_th
         made.append(popen([sys.executable, "-c", "import time; time.sleep(60)"], **more))
         return made[-1]
 
-    monkeypatch.setattr(_project_run, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(_compile_ahead, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(_project_run, "_core_count", lambda: cores)
     monkeypatch.setattr(_project_run.subprocess, "Popen", waits)
     monkeypatch.setattr(_start, "steps", changed)
     if before:
-        monkeypatch.setattr(_project_run, "_compiled_before", lambda: short)
+        monkeypatch.setattr(_compile_ahead, "compiled_before", lambda: short)
     assert states(call) == [False] * 3
     assert len(made) == begun
     assert all(one.returncode for one in made), "it was ended"
@@ -212,16 +212,16 @@ def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model(
     Path("models").mkdir()
     monkeypatch.setattr(softneck, "tuning", tuning)
     monkeypatch.setattr(softneck, "estimation", estimation)
-    monkeypatch.setattr(_project_run.os, "nice", int)
-    monkeypatch.setattr(_project_run.time, "sleep", comes)
-    monkeypatch.setattr(_project_run, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(_compile_ahead.os, "nice", int)
+    monkeypatch.setattr(_compile_ahead.time, "sleep", comes)
+    monkeypatch.setattr(_compile_ahead, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(softneck.signals, "read_recording", lambda name: name)
-    monkeypatch.setattr(_project_run, "load", lambda name: _Family() if name == _plan.FAMILY else "best")
-    _project_run.compile_ahead("log.csv")
+    monkeypatch.setattr(_compile_ahead, "load", lambda name: _Family() if name == _plan.FAMILY else "best")
+    _compile_ahead.compile_ahead("log.csv")
     # The search needs the loops of margins last, so these are compiled first: then the two cores do different ones.
     assert ran == [("drawn",), ("drawn", "margins", False), ("drawn", "linear", False), ("best", "margins", True),
                    ("best", "linear", True)]  # fmt: skip
-    assert _project_run._compiled_before().is_file()
+    assert _compile_ahead.compiled_before().is_file()
 
 
 @dataclass(frozen=True)
@@ -231,10 +231,10 @@ class _Family:
 
 def test_what_is_compiled_ahead_ends_with_the_run_that_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     parents = iter([7, 7, 1])
-    monkeypatch.setattr(_project_run.os, "getppid", lambda: next(parents))
-    monkeypatch.setattr(_project_run.time, "sleep", lambda _: None)
+    monkeypatch.setattr(_compile_ahead.os, "getppid", lambda: next(parents))
+    monkeypatch.setattr(_compile_ahead.time, "sleep", lambda _: None)
     with pytest.raises(SystemExit):
-        _project_run._await("never.npz")
+        _compile_ahead._await("never.npz")
 
 
 @pytest.fixture

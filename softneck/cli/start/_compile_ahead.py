@@ -1,0 +1,59 @@
+"""Compile what later steps of `start` call, in a process beside the steps before them."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import softneck
+from softneck.core import load
+from softneck.robot import Robot
+from softneck.runtime import cache_folder
+
+from ._plan import FAMILY, PI, linear_model, nonlinear_model
+
+
+def compile_ahead(*recordings: str) -> None:
+    """Compile what the steps after the models call, in a process that no step waits for, with the lowest priority.
+
+    Run are an observer and the loops of one controller, over the model of the draws and over that of the loops, when
+    they are there; the steps then load the functions from the cache.
+    """
+    from softneck import estimation, signals, tuning
+
+    getattr(os, "nice", int)(19)
+    family = _await(FAMILY)
+    observer = estimation.KalmanSettings().design(family)
+    fitted = estimation.fit_observer(observer, [signals.read_recording(name) for name in recordings], set())
+    estimation.consistency(fitted.observer, signals.read_recording(recordings[0]))
+    bare = replace(family, draws=None)  # with draws, margins would be those of 59
+    for model in [] if family.draws is None else [family.draws.model, None]:
+        if model is None:
+            _await(PI)
+        task = tuning.task_of([bare, model or load(nonlinear_model() or linear_model())], None, 0)
+        for level in reversed(tuning.LEVELS):  # margins first: the search needs their loops last
+            tuning.judge_candidate(task, "pi", {}, level)
+    compiled_before().touch()
+
+
+def _await(name: str) -> Any:
+    """Return the content of a file when it is there; end if the process that began this one ended before."""
+    parent = os.getppid()
+    while not Path(name).is_file():
+        time.sleep(0.2)
+        if os.getppid() != parent:
+            sys.exit(1)
+    return load(name)
+
+
+def compiled_before() -> Path:
+    """Return a file that is there if a run for as many motors and outputs has compiled these runtimes."""
+    robot = Robot.read("robot.toml")
+    content = [path.read_bytes() for path in sorted(Path(softneck.__file__).parent.rglob("*_runtime.py"))]
+    sizes = f"{len(robot.motors.names)}_{len(robot.outputs.names)}"
+    return cache_folder() / f"start_{sizes}_{hashlib.sha256(b''.join(content)).hexdigest()[:16]}"
