@@ -84,7 +84,7 @@ def certify_search(
         task, own={**task.own, **failing}, drawn=(*task.drawn, *failing), digest=digest,
         asked=replace(task.asked, kept=_more_kept(task.asked.kept, failed)),
     )  # fmt: skip
-    prepare(more)
+    prepare(more).kept.update(prepare(task).kept)  # designs need no draws
     again = replace(
         search, task=more, log=Log(None, digest), budget=round(_RESUMED_SHARE * search.budget), candidates={},
         spent=set(), earlier=len(search.spent),

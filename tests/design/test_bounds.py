@@ -242,14 +242,16 @@ def test_the_last_kept_is_that_of_all_halvings_by_fewer_tries(curve: Callable[[f
             tried.append(x)
             return curve(math.log(x / crossing))
 
-        found = last_kept(excess, low, high, begin=curve(math.log(low / crossing)), halvings=halvings)
+        found = last_kept(excess, low, high, halvings=halvings)
         a, b = low, high
         for _ in range(halvings):
             middle = math.sqrt(a * b)
             a, b = (middle, b) if middle <= crossing else (a, middle)
         assert found == a
         assert len(tried) == len(set(tried))
-        assert low < min(tried)
+        # The lowest is tried only where the first halving is not kept.
+        assert (low in tried) == (math.sqrt(low * high) > crossing)
+        assert low <= min(tried)
         assert max(tried) < high
         counts.append(len(tried))
     # Four tries may have followed nothing. Of a line in log(x) two halvings and both ends of an interval are tried.

@@ -1320,7 +1320,10 @@ def resumable(monkeypatch: pytest.MonkeyPatch, values: dict[str, float], *, foun
             holds=fine, failed=[] if fine else failed, evidence=SimpleNamespace(drawn=[part])))  # fmt: skip
 
     monkeypatch.setattr(_certify, "certify", certify)
-    monkeypatch.setattr(_certify, "prepare", lambda _: None)
+    made: dict[str, Any] = {}
+    monkeypatch.setattr(
+        _certify, "prepare", lambda task: made.setdefault(task.digest, SimpleNamespace(kept={task.digest: 1}))
+    )
     monkeypatch.setattr(_certify, "_drawn_in_search", lambda *_: [part])
     return search, _certify.certify_search(search, None, lambda *_: None), verified
 
@@ -1433,6 +1436,8 @@ def test_draws_that_fail_a_certificate_join_the_plants_of_a_search_that_resumes(
     assert [model.arrays[0] for model in list(again.task.own.values())[2:]] == [2, 1]
     assert again.task.asked.kept == {"axes.gain_margin": pytest.approx(0.5)}
     assert (certified.item.kind, tried) == ("b", 3)
+    # What the first search designed is not designed again.
+    assert _certify.prepare(again.task).kept == {"d": 1, again.task.digest: 1}
 
 
 @pytest.mark.parametrize("budget", [3, 30])

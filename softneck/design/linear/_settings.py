@@ -367,27 +367,29 @@ class AxisSettings(LoopSettings, ABC):
             peak = math.inf if found is None else self._sensitivity(found.controller, axis)
             if peak <= self.max_sensitivity:
                 best = found
+            elif speed == low:
+                raise SettingsError(
+                    f"not even a {what} of {low:.3g} rad/s keeps Ms <= {self.max_sensitivity:g} on all "
+                    f"{len(axis.samples)} samples; raise `max_sensitivity`, or give `{what}` and see what is lost."
+                )
             return 1.0 / self.max_sensitivity - (1.0 / peak if peak > 0.0 else 0.0)
 
-        begin = excess(low)
-        if best is None:
-            raise SettingsError(
-                f"not even a {what} of {low:.3g} rad/s keeps Ms <= {self.max_sensitivity:g} on all "
-                f"{len(axis.samples)} samples; raise `max_sensitivity`, or give `{what}` and see what is lost."
-            )
         # Two decades to 3 %.
-        last_kept(excess, low, high, begin=begin, halvings=math.ceil(math.log2(math.log(high / low) / 0.03)))
-        return best
+        last_kept(excess, low, high, halvings=math.ceil(math.log2(math.log(high / low) / 0.03)))
+        return best  # pyright: ignore[reportReturnType] - where nothing else is kept, `low` was tried
 
 
-def last_kept(excess: Callable[[float], float], low: float, high: float, *, begin: float, halvings: int) -> float:
+def last_kept(excess: Callable[[float], float], low: float, high: float, *, halvings: int) -> float:
     """Return the end at which the excess is at most 0 after halvings of log(low) to log(high), by fewer tries.
 
-    The excess is `begin` <= 0 at `low` and changes its sign once; at `high`, which is not tried, it counts as positive.
-    Tried are the ends of the last interval where a parabola through three tries crosses 0, in the end halvings.
+    The excess is at most 0 at `low`, which is tried where the first halving is not kept, and changes its sign once; at
+    `high`, which is not tried, it counts as positive. Tried are the ends of the last interval where a parabola through
+    three tries crosses 0, in the end halvings.
     """
-    kept, lost, before, tries = (low, begin), (high, math.inf), (high, math.inf), 0
+    kept, lost, before, tries = (low, math.nan), (high, math.inf), (high, math.inf), 0
     while True:
+        if kept[0] == low and lost[0] < high and math.isnan(kept[1]):
+            kept = (low, excess(low))
         # A function that five tries did not follow is halved.
         halved = math.isinf(lost[1]) or tries > 4
         crossing = math.nan if halved else _crossing(kept, lost, before)
