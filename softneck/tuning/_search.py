@@ -101,7 +101,7 @@ class Candidate:
         found = list(self.ratios(bounds, tested=tested).values())
         if self.error or not found:
             return math.inf
-        beyond = sum(_saturate(value - 1.0) for value in found if value > 1.0)
+        beyond = sum(_saturate(max(value - 1.0, 0.0)) for value in found)
         rest = _TIE_WEIGHT * float(np.mean([min(value, 1.0) for value in found]))
         return (1.0 + beyond if beyond > 0.0 else (1.0 - _TIE_WEIGHT) * max(found)) + rest
 
@@ -315,11 +315,9 @@ class Search:
         wanted: dict[Job, Candidate] = {}
         for item in items:
             job = Job.of(item.kind, item.settings, level)
-            if item.level == level or item.error or job in wanted or job in self.spent:
-                continue
-            if self._remaining(reserved) - len(wanted) <= 0:
-                break
-            wanted[job] = item
+            judged = item.level == level or item.error or job in self.spent
+            if not judged and len(wanted) < self._remaining(reserved):
+                wanted.setdefault(job, item)
         run_jobs([job for job in wanted if job not in self.log.found], self._submit, self.crew, self._store)
         for job, item in wanted.items():
             self.spent.add(job)

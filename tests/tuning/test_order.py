@@ -613,12 +613,13 @@ def test_curves_are_of_the_plain_steps_from_the_lowest_to_the_highest(monkeypatc
         if loop.circle:
             return _circle(2 + loop.plant)
         t = np.arange(300) * TS
-        on = (t >= 0.5 - 1e-9).astype(float)
+        begin = (30, 40, 25)[loop.plant]
+        on = (t >= begin * TS - 1e-9).astype(float)
         size = (0.3, 0.1, 0.2)[loop.plant]
         signals = {"pitch": bent + size * on, "roll": 9.0 * on, "pitch_reference": bent + 0.2 * on,
                    "roll_reference": 0.0 * on}  # fmt: skip
         share = (5.0, 3.0, 1.0)[loop.plant]
-        moved = {f"motor_setpoint_{j}": share * j * (1.0 + np.arange(300) - 25) * on for j in (1, 2, 3)}
+        moved = {f"motor_setpoint_{j}": share * j * (1.0 + np.arange(300) - begin) * on for j in (1, 2, 3)}
         return LoopResult(t, signals | moved, {}, TS)
 
     still = RobotReference(kind="step", values=(0.2, 0.0), at=0.5)
@@ -765,6 +766,8 @@ def test_a_ratio_is_one_at_the_limit_and_above_it_beyond(bound: str) -> None:
     item, sign = Requirement("m", bound, 2.0, True), -1.0 if bound == "min" else 1.0
     assert ratio(item, 2.0 - 0.1 * sign) < 1.0 < ratio(item, 2.0 + 0.1 * sign)
     assert (ratio(item, 2.0) <= 1.0) is (bound != "below")
+    for value in (0.5, 3.0):
+        assert ratio(item, value) == (2.0 / value if bound == "min" else value / 2.0)
     zero = Requirement("m", bound, 0.0, True)
     if bound != "min":
         assert ratio(zero, 0.1) == math.inf
@@ -1205,7 +1208,7 @@ def test_a_step_over_an_observer_holds_where_every_loop_of_full_size_does(
     assert held is (lost is None)
     assert run == [(every[0], 0, "parallel", "eyes"), (every[1], 1, "parallel", "eyes")]
     # An observer that makes the steps rise more than a tenth later is left out.
-    for rise, quick in ((0.92, True), (0.9, False)):
+    for rise, quick in ((0.92, True), (1.0 / 1.1, True), (0.9, False)):
         item = Candidate("pi", {}, np.zeros(1), metrics={"sim.rise_s": rise})
         assert _certify.holds_with_observer(task, item, observer, bounds) is quick  # only the first two loops are lost
     ready.all = every[2:]

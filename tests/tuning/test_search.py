@@ -286,6 +286,7 @@ def test_the_front_is_what_no_other_beats() -> None:
     rng = np.random.default_rng(1)
     items = [candidate(a=x, b=-y, axes__gain_margin=y) for x, y in rng.integers(0, 6, (40, 2)).astype(float)]
     kept = front(items, ["a", "axes.gain_margin"])
+    assert front([], ["a"]) == front(items, []) == []
     # It begins with the best in the first objective.
     for names in (["a", "b"], ["b", "a"]):
         firsts = [item.metrics[names[0]] for item in front(items, names)]
@@ -308,6 +309,10 @@ def test_what_binds_is_what_alone_must_give_way_least() -> None:
         assert active_requirement(listed, BOUNDS, tested=False) == ("sim.rise_s", pytest.approx(0.52))
     assert active_requirement([fast, loud], BOUNDS, tested=False) == ("sim.overshoot_pct", pytest.approx(7.0))
     assert active_requirement([loud], BOUNDS, tested=False) == ("axes.gain_margin", None)
+    # Of several that miss two limits the best tells which.
+    worst = candidate(sim__rise_s=0.9, sim__overshoot_pct=30.0, axes__gain_margin=1.0)
+    for listed in ([loud, worst], [worst, loud]):
+        assert active_requirement(listed, BOUNDS, tested=False) == ("axes.gain_margin", None)
     good = candidate(sim__rise_s=0.3, sim__overshoot_pct=5.0, axes__gain_margin=2.0)
     assert active_requirement([good, slow], BOUNDS, tested=False) == (None, None)
 
