@@ -67,9 +67,9 @@ def certify_search(
 
     Where draws of the search or of its certificate fail, the worst of them join the plants and the search resumes.
     """
-    task, best = search.task, search.sort_candidates()[:1]
-    failed = _failed_in_search(task, best[0]) if best else []
-    drawn = _drawn_in_search(task, best[0]) if failed else []
+    task, best = search.task, next(iter(search.sort_candidates()), None)
+    failed = [] if best is None else _failed_in_search(task, best)
+    drawn = _drawn_in_search(task, best) if best and failed else []
     failing = _failing_draws(drawn, failed)
     certified, tried = (None, 0) if failing else _verify_best(search, 0, files, progress)
     if certified is not None:

@@ -200,7 +200,7 @@ class Search:
 
     def _rank(self, item: Candidate) -> tuple[int, float]:
         """Return the sort key: the level, later ones first, then the cost."""
-        return -LEVELS.index(item.level) if item.level else 1, self.cost(item)
+        return -("", *LEVELS).index(item.level), self.cost(item)
 
     def _remaining(self, reserved: int) -> int:
         return self.budget - reserved - len(self.spent)

@@ -1469,6 +1469,21 @@ def test_a_search_that_resumes_judges_its_starts_and_neighbours_within_its_budge
     assert said == begun + [("margins", ["a", "b"])] * (finals > 0)
 
 
+@pytest.mark.parametrize("observer", [None, "given"])
+def test_the_draws_of_a_search_are_run_with_the_observer_that_is_given_or_else_that_of_the_kind(
+    observer: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_certify, "prepare", lambda task: ("ready", task))
+    made = SimpleNamespace(block=lambda: "block", order="parallel")
+    monkeypatch.setattr(
+        _certify, "design_candidate", lambda *given: made if given[1:3] == (("ready", "t"), "pi") else None
+    )
+    monkeypatch.setattr(_certify, "make_observer", lambda *given: given)
+    monkeypatch.setattr(_certify, "search_draws", lambda *given: given)
+    found = _certify._drawn_in_search("t", Candidate("pi", {}, np.zeros(1)), observer)  # pyright: ignore[reportArgumentType]
+    assert found == ("t", "block", "parallel", observer or ("t", "pi"))
+
+
 @pytest.mark.parametrize("observed", [True, False])
 def test_a_certificate_is_of_the_loop_that_is_delivered_without_the_draws_of_the_search(
     observed: bool, monkeypatch: pytest.MonkeyPatch
@@ -1582,6 +1597,7 @@ def test_the_rise_that_is_aimed_at_is_the_shortest_asked_or_two_time_constants()
     ("made", "held"),
     [
         ([], None), ([([0.0, 0.0], [0.2, 0.6])], 0.4), ([([0.0, 0.0], [-0.6, 0.6])], None),
+        ([([0.0, 1.0], [0.2, 0.4]), ([0.5, 0.5], [0.8, 1.0])], 0.3),
         ([([0.0, 0.0], [0.05, 0.05])], None), ([([0.0, 0.0], [0.05, 0.052])], 0.051),
         # Of the heaviest load, the middle one of several.
         ([([0.0, 0.0], [2.0, 2.0]), ([0.5, 1.0], [0.5, 0.7]), ([1.0, 1.0], [0.1, 0.3]), ([1.0, 1.0], [1.0, 1.2])], 0.6),
@@ -1762,3 +1778,6 @@ def test_default_payloads_end_where_the_draws_of_every_family_have_them(
     asked.clear()
     _tune._read_requirements({}, Robot.preset(), [SimpleNamespace(draws=None)], stepping=True)
     assert set(asked) == {None}
+    # What was read stays as it is.
+    read = make_tune_requirements({})
+    assert _tune._read_requirements(read, Robot.preset(), families, stepping=True) is read

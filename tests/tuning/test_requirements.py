@@ -18,10 +18,12 @@ import tomli_w
 from scipy.signal import lfilter
 
 from softneck.core import FileFormatError, SettingsError
+from softneck.design import axis_test
 from softneck.estimation import LinearNeck
 from softneck.loop.default_limits import NECK_RISE_S
 from softneck.report._tune import _toml_table
 from softneck.robot import TIME_CONSTANT, Robot
+from softneck.tuning import _requirements
 from softneck.tuning._requirements import (
     _TRACK_NUMBERS,
     USUAL_RISE,
@@ -36,6 +38,8 @@ from softneck.tuning._task import _closer
 from softneck.tuning._tune import task_of
 from softneck.verification import Requirement, make_requirements, read_requirements
 from softneck.verification._metrics import Scale
+
+from ..design.test_robots import BELLOWS, LEARNED, plant
 
 TS = 0.02
 GAIN, POLE, DELAY = math.radians(5.23), 5.293, 4
@@ -384,6 +388,20 @@ def test_the_fastest_rise_is_that_of_the_slowest_axis_that_the_motors_move_far_e
         assert fastest_rise(LinearNeck(pitch=one, roll=other)) == both
     assert fastest_rise(LinearNeck(pitch=weak, roll=quick)) > 1.5 * fastest_rise(neck())
     assert fastest_rise(LinearNeck(pitch=none, roll=none)) == 0.0
+
+
+def test_the_motors_limits_are_those_of_the_inputs_that_they_move(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A share of each motor in an input, not of an input in each motor: on a robot whose shares differ."""
+    own, seen = plant(BELLOWS, gain=5e-8), list[Any]()
+    monkeypatch.setattr(_requirements, "axis_test", lambda *given: seen.append(given[2]) or axis_test(*given))
+    asked = task_of({"model": own}, {}, 0).asked
+    seen.clear()
+    for of in (fastest_rise, lambda own: default_rise([own], asked), lambda own: check_feasibility(asked, own)):
+        of(own)
+        assert len(seen) >= len(BELLOWS.outputs.names)
+        for inverse in seen:
+            np.testing.assert_allclose(LEARNED @ inverse[:, :3], np.eye(3), atol=1e-12)
+        seen.clear()
 
 
 def test_the_default_rise_is_that_of_the_slowest_axis() -> None:
