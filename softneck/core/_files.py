@@ -55,12 +55,12 @@ def settings_text(path: str | Path, most: int = MOST_TOML) -> str:
     return text
 
 
-def require_size(path: Path, most: int = MOST_LOG) -> None:
-    """Raise FileFormatError if a file is larger than `most` [bytes], or too large for the memory that is free."""
+def require_size(path: Path) -> None:
+    """Raise FileFormatError if a log is larger than `MOST_LOG`, or too large for the memory that is free."""
     about = path.stat()
     size, stored = about.st_size, 512 * about.st_blocks
-    if size > most:
-        raise FileFormatError(f"{path}: {_too_large(size, most)}. {_CUT_IT}")
+    if size > MOST_LOG:
+        raise FileFormatError(f"{path}: {_too_large(size, MOST_LOG)}. {_CUT_IT}")
     if size > largest_unpacked(stored) and stored:  # 0 where a file system does not count
         raise FileFormatError(
             f"{path}: is {_size_text(size)} long, but {_size_text(stored)} on the disk (a sparse file). {_CUT_IT}"

@@ -8,9 +8,19 @@ import math
 
 import numpy as np
 
-from softneck.estimation._kalman_parts_runtime import KALMAN_GATE, KALMAN_LEAD, KALMAN_PERIOD, KalmanCounters
+from softneck.estimation._kalman_parts_runtime import (
+    KALMAN_GATE,
+    KALMAN_LAG,
+    KALMAN_LEAD,
+    KALMAN_PERIOD,
+    KalmanCounters,
+    kalman_count,
+    kalman_forced,
+    kalman_healthy,
+    kalman_usable,
+)
 from softneck.runtime._layout import Arrays, array, cells, rest, value
-from softneck.runtime._members_runtime import member_initialise, member_step
+from softneck.runtime._members_runtime import member_initialise, member_size, member_step
 
 # Places in `setup`; the model has more outputs than the measured ones.
 NONLINEAR_MOTORS = 0
@@ -194,3 +204,67 @@ def nonlinear_tell(
         late = told[m + i] * (earlier[i] + part * (motion[i] - earlier[i]))
         outputs[i] = before[i] + part * motion[i] + told[i] + late
         outputs[m + i] = motion[i] / c[KALMAN_PERIOD]
+
+
+def nonlinear_begin(p: NonlinearArrays, x: NonlinearState, asked: np.ndarray) -> None:
+    """Start with motors at their set-points; nothing is known of what the model misses."""
+    start, timing, m = p.setup[NONLINEAR_START], p.setup[NONLINEAR_TIMING], p.outputs
+    for i in range(m):
+        x.P[i, i] = start * start
+        x.P[m + i, m + i] = timing * timing
+    x.held[:] = asked
+    x.reached[:] = asked
+
+
+def nonlinear_reach(p: NonlinearArrays, x: NonlinearState, asked: np.ndarray) -> None:
+    """Move the model's set-points for one sample."""
+    if p.constants[KALMAN_LAG] > 0.5:
+        nonlinear_slew(p, x.reached, x.held)
+    else:
+        nonlinear_slew(p, x.reached, asked)
+    x.held[:] = asked
+
+
+def nonlinear_judge(p: NonlinearArrays, noise: float, x: NonlinearState, inputs: np.ndarray) -> float:
+    """Correct the estimates if there is a measurement that passes the gate; return the NIS."""
+    measured = inputs[p.motors : p.motors + p.outputs]
+    usable = kalman_usable(p.constants, x, measured, float(inputs[p.motors + p.outputs]), noise)
+    forced = kalman_forced(p.constants, x)
+    if forced:
+        # Large enough for the estimate to jump to the measurement.
+        start = p.setup[NONLINEAR_START]
+        for i in range(p.outputs):
+            x.P[i, i] += start * start
+    innovation, accepted = 0.0, False
+    if usable:
+        innovation, accepted = nonlinear_correct(p, noise, x, measured, forced)
+    kalman_count(p.constants, x, usable, accepted)
+    return innovation
+
+
+def nonlinear_answer(
+    p: NonlinearArrays,
+    noise: float,
+    free: np.ndarray,
+    x: NonlinearState,
+    asked: np.ndarray,
+    innovation: float,
+    outputs: np.ndarray,
+) -> None:
+    """Fill the outputs that all forms have, and count the sample; `free`: the model's parameters in simulation."""
+    models, m = x.models, p.outputs
+    # Copies: the filter's model stays at the time of the measurement.
+    nonlinear_tell(
+        p,
+        free,
+        models[: member_size(p, 0)].copy(),
+        x.angles.copy(),
+        x.motion.copy(),
+        x.told,
+        x.reached.copy(),
+        asked,
+        outputs,
+    )
+    outputs[2 * m] = innovation
+    outputs[2 * m + 1] = 1.0 if kalman_healthy(p.constants, x, noise) else 0.0
+    x.samples += 1.0

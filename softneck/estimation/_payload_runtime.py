@@ -7,27 +7,19 @@ Ljung and Soderstrom 1983, sec. 3.3). It is kept within the payloads of the reco
 
 import numpy as np
 
-from softneck.estimation._kalman_parts_runtime import (
-    KALMAN_LAG,
-    kalman_clear,
-    kalman_count,
-    kalman_forced,
-    kalman_healthy,
-    kalman_usable,
-)
+from softneck.estimation._kalman_parts_runtime import kalman_clear
 from softneck.estimation._nonlinear_parts_runtime import (
-    NONLINEAR_START,
-    NONLINEAR_TIMING,
     PAYLOAD_LEAST,
     PAYLOAD_MOST,
     PAYLOAD_WALK,
     NonlinearArrays,
     NonlinearState,
-    nonlinear_correct,
+    nonlinear_answer,
+    nonlinear_begin,
+    nonlinear_judge,
     nonlinear_move,
+    nonlinear_reach,
     nonlinear_settle,
-    nonlinear_slew,
-    nonlinear_tell,
     nonlinear_widen,
 )
 from softneck.runtime._members_runtime import member_size
@@ -59,39 +51,13 @@ def step(
     outputs: pitch, roll, pitch_rate, roll_rate, innovation, healthy, payload.
     parameters: standard deviations of measurement and disturbance at rest, ratio of the disturbance to the motion.
     """
-    c, n, m = p.constants, p.motors, p.outputs
-    asked, measured = inputs[:n], inputs[n : n + m]
-    start = p.setup[NONLINEAR_START]
+    asked = inputs[: p.motors]
     if x.samples == 0.0:
         payload_start(p, x, asked)
-    usable = kalman_usable(c, x, measured, float(inputs[n + m]), parameters[0])
-    forced = kalman_forced(c, x)
     payload_predict(p, parameters, x, asked)
-    if forced:
-        # Large enough for the estimate to jump to the measurement.
-        for i in range(m):
-            x.P[i, i] += start * start
-    innovation, accepted = 0.0, False
-    if usable:
-        innovation, accepted = nonlinear_correct(p, parameters[0], x, measured, forced)
-    kalman_count(c, x, usable, accepted)
-    models = x.models
-    # Copies: the filter's model stays at the time of the measurement.
-    nonlinear_tell(
-        p,
-        payload_free(p, x.payload),
-        models[: member_size(p, 0)].copy(),
-        x.angles.copy(),
-        x.motion.copy(),
-        x.told,
-        x.reached.copy(),
-        asked,
-        outputs,
-    )
-    outputs[2 * m] = innovation
-    outputs[2 * m + 1] = 1.0 if kalman_healthy(c, x, parameters[0]) else 0.0
-    outputs[2 * m + 2] = x.payload
-    x.samples += 1.0
+    innovation = nonlinear_judge(p, parameters[0], x, inputs)
+    nonlinear_answer(p, parameters[0], payload_free(p, x.payload), x, asked, innovation, outputs)
+    outputs[2 * p.outputs + 2] = x.payload
 
 
 def payload_free(p: NonlinearArrays, payload: float) -> np.ndarray:
@@ -107,14 +73,10 @@ def payload_start(p: NonlinearArrays, x: NonlinearState, asked: np.ndarray) -> N
     A controller keeps tendons taut for the estimate. Too light an estimate leaves them slack, and a slack neck does not
     show its payload.
     """
-    start, timing, models, size = p.setup[NONLINEAR_START], p.setup[NONLINEAR_TIMING], x.models, member_size(p, 0)
+    models, size = x.models, member_size(p, 0)
     m = p.outputs
-    for i in range(m):
-        x.P[i, i] = start * start
-        x.P[m + i, m + i] = timing * timing
+    nonlinear_begin(p, x, asked)
     x.P[2 * m, 2 * m] = (p.load[PAYLOAD_MOST] - p.load[PAYLOAD_LEAST]) ** 2
-    x.held[:] = asked
-    x.reached[:] = asked
     more = np.empty(m)
     nonlinear_settle(p, payload_free(p, x.payload), models[:size], asked, x.angles)
     nonlinear_settle(p, payload_free(p, x.payload + PAYLOAD_STEP), models[size:], asked, more)
@@ -123,11 +85,7 @@ def payload_start(p: NonlinearArrays, x: NonlinearState, asked: np.ndarray) -> N
 def payload_predict(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, asked: np.ndarray) -> None:
     """Simulate both copies for one sample, and increase the covariance."""
     models, size, before, more = x.models, member_size(p, 0), x.angles.copy(), np.empty(p.outputs)
-    if p.constants[KALMAN_LAG] > 0.5:
-        nonlinear_slew(p, x.reached, x.held)
-    else:
-        nonlinear_slew(p, x.reached, asked)
-    x.held[:] = asked
+    nonlinear_reach(p, x, asked)
     nonlinear_move(p, payload_free(p, x.payload), models[:size], x.reached, x.angles)
     nonlinear_move(p, payload_free(p, x.payload + PAYLOAD_STEP), models[size:], x.reached, more)
     for i in range(p.outputs):

@@ -12,7 +12,7 @@ from softneck.robot import Robot
 from softneck.runtime import Block, State
 from softneck.signals import Excitation, Recording, signal
 
-from ._neck import INTERNAL_STEP, VirtualNeck
+from ._neck import VirtualNeck
 from ._parameters import NeckParameters
 
 # Before a recording starts the set-points rise from rest to their first row and are held [s]; on the
@@ -27,7 +27,6 @@ def record(
     seed: int = 0,
     payload: float = 0.0,
     noise: bool = True,
-    internal_step: float = INTERNAL_STEP,
 ) -> Recording:
     """Run a signal on the virtual neck and return the recording.
 
@@ -40,7 +39,6 @@ def record(
         seed: of the sensor's noise.
         payload: mass on the platform [kg], 0 to 5.
         noise: False gives a perfect sensor that keeps its lag and delay.
-        internal_step: longest [s]; a sample takes equal steps.
 
     Raises:
         DataError: set-points that are not finite or beyond the limits of the neck or robot.
@@ -68,9 +66,7 @@ def record(
     P = np.asarray(excitation.set_points, dtype=np.float64)
     _check_set_points(P, excitation, neck)
     parameters = neck.parameters if noise else neck.parameters.without_noise()
-    block = replace(neck, parameters=parameters).block(
-        noise_seed=seed, sample_time=excitation.sample_time, internal_step=internal_step
-    )
+    block = replace(neck, parameters=parameters).block(noise_seed=seed, sample_time=excitation.sample_time)
     state = settle(block, P[0], payload=payload)
     U = _inputs(block, P, payload)
     _, Y = block.run(state, U[:-1])

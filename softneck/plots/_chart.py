@@ -197,12 +197,12 @@ def bar_width(x: Vector) -> float:
 _DASHES = {"dashed": "--", "dotted": ":"}
 
 
-def chart_figure(chart: Chart, *, width: float = 10.0) -> Figure:
-    """Draw a chart as a figure of `width` [inch]."""
+def chart_figure(chart: Chart) -> Figure:
+    """Draw a chart as a figure."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, chart.row_height * chart.rows + 0.4), layout="constrained")
+    figure = Figure(figsize=(10.0, chart.row_height * chart.rows + 0.4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(chart.rows, chart.columns, sharex=chart.linked, squeeze=False).ravel()
     for number, (ax, panel) in enumerate(zip(axes, chart.panels, strict=False)):

@@ -180,7 +180,6 @@ def loop_chart(
     title: str,
     *,
     limits: Mapping[str, float] | None = None,
-    caption: str = "",
     robot: Robot = NECK,
 ) -> Chart:
     """Describe a closed loop: reference, true, measured and estimated outputs, motors, and tensions.
@@ -208,7 +207,7 @@ def loop_chart(
             if f"tension_{j}" in signals
         ]
         panels.append(Panel(pulls, "tension [N]"))
-    return Chart(title, panels, caption=caption)
+    return Chart(title, panels)
 
 
 def _motor(robot: Robot, number: int) -> str:
@@ -398,7 +397,7 @@ def pareto_chart(
     return Chart(title, [Panel(curves, labels[1])], labels[0], caption=caption, row_height=4.0)
 
 
-def distribution_chart(values: Mapping[str, Mapping[str, Vector]], title: str, *, caption: str = "") -> Chart:
+def distribution_chart(values: Mapping[str, Mapping[str, Vector]], title: str) -> Chart:
     """Describe distributions over runs, metric -> group -> (n,): a panel for each metric, a curve for each group."""
     panels = []
     for metric, groups in values.items():
@@ -408,12 +407,10 @@ def distribution_chart(values: Mapping[str, Mapping[str, Vector]], title: str, *
             panels.append(_shares(metric, known, legend=not panels))
     if not panels:
         raise DataError("no run has a metric to show.")
-    return Chart(title, panels, linked=False, caption=caption, row_height=2.0)
+    return Chart(title, panels, linked=False, row_height=2.0)
 
 
-def influence_chart(
-    inputs: Mapping[str, Vector], metric: tuple[str, Vector], failed: np.ndarray, title: str, *, caption: str = ""
-) -> Chart:
+def influence_chart(inputs: Mapping[str, Vector], metric: tuple[str, Vector], failed: np.ndarray, title: str) -> Chart:
     """Describe the influence of numeric settings on a metric: a panel for each setting, a point for each run.
 
     `inputs` holds key -> (n,) settings, `metric` a label and (n,) values, and `failed` (n,) marks runs that break a
@@ -430,7 +427,7 @@ def influence_chart(
                 curves.append(Curve(np.asarray(x, float)[known], y[known], name, colour, "points", _POINT_WIDTH))
         curves = curves or [Curve(np.zeros(0), np.zeros(0), "", GREY, "points")]
         panels.append(Panel(curves, label, x_label=key, legend=not panels))
-    return Chart(title, panels, linked=False, caption=caption, row_height=2.0)
+    return Chart(title, panels, linked=False, row_height=2.0)
 
 
 def pareto_figure(

@@ -62,11 +62,9 @@ def kept_runs(runs: pd.DataFrame) -> str:
     return f"{sum(map(bool, held))} of {len(held)} runs keep all limits" if held else f"{len(runs)} runs, no limits"
 
 
-def study_rows(
-    runs: pd.DataFrame, keys: Sequence[str], objectives: Sequence[str], count: int = _MAX_ROWS
-) -> list[list[str]]:
+def study_rows(runs: pd.DataFrame, keys: Sequence[str], objectives: Sequence[str]) -> list[list[str]]:
     """Return the best runs as rows of text: number, varied values, objectives, verdict."""
-    return [_row(row, keys, objectives) for row in rank(runs, objectives).head(count).to_dict("records")]
+    return [_row(row, keys, objectives) for row in rank(runs, objectives).head(_MAX_ROWS).to_dict("records")]
 
 
 def study_head(keys: Sequence[str], objectives: Sequence[str]) -> list[str]:

@@ -36,7 +36,7 @@ _FIT_COLUMNS = (
 _MAX_RATIO = 10.0
 
 
-def validation_page(results: Sequence[Validation], *, title: str = "Validation") -> str:
+def validation_page(results: Sequence[Validation]) -> str:
     """Return the HTML page of all results, with interactive charts; it opens with `validation_decision`.
 
     Models that were judged on the same rows first have one chart of all their simulations.
@@ -46,7 +46,7 @@ def validation_page(results: Sequence[Validation], *, title: str = "Validation")
     charts = together or [curves(results[0])]
     sections = [Section("Fits", charts=charts, tables=[fit_table(results)], method=[note])]
     sections += [_section(r, drawn=not together and r is results[0]) for r in results]
-    return page(title, sections, verdict=decision, footer="Written by softneck validate.")
+    return page("Validation", sections, verdict=decision, footer="Written by softneck validate.")
 
 
 def fit_table(results: Sequence[Validation]) -> Table:

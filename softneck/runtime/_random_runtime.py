@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 
-RANDOM_SIZE = 6
 _M1 = 4294967087.0
 _M2 = 4294944443.0
 

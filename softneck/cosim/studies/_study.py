@@ -282,9 +282,9 @@ class Study(ReprMixin):
             raise SettingsError(f"the study has runs 0 to {len(self.points) - 1}; there is no run {run}.")
         return with_values(self.loop, self.points[run].values)
 
-    def setup(self, run: int, *, opened: dict[Any, Any] | None = None) -> LoopSetup:
+    def setup(self, run: int) -> LoopSetup:
         """Return the loop of one run, ready for `simulate`."""
-        return make_loop(self.table(run), self.folder, opened=opened)
+        return make_loop(self.table(run), self.folder)
 
     def check(self) -> None:
         """Open the loop of the first run with each part in turn, and check that it has all keys."""

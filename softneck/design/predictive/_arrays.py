@@ -141,7 +141,7 @@ _NO_LIMIT = 1e12
 _UNIT_STEP = 2.0**-10
 
 
-def lti(arrays: tuple[Matrix, ...], robot: Robot, *, name: str = "mpc") -> control.StateSpace:
+def lti(arrays: tuple[Matrix, ...], robot: Robot) -> control.StateSpace:
     """Return it from references and outputs to redefined inputs, of the neck theta_i and phi_i.
 
     Its matrices are what the runtime's own `step` does to unit vectors. With preview the reference counts as known only
@@ -158,7 +158,7 @@ def lti(arrays: tuple[Matrix, ...], robot: Robot, *, name: str = "mpc") -> contr
     return control.StateSpace(
         A, B, C, D, float(rt.MpcArrays(arrays).constants[rt.MPC_TS]),
         inputs=[*(f"{output}_reference" for output in names), *names],
-        outputs=list(robot.input_names), name=name,
+        outputs=list(robot.input_names), name="mpc",
     )  # fmt: skip
 
 

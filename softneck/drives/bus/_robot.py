@@ -99,11 +99,11 @@ def channels_of(robot: Robot | None, limits: LimitSettings) -> ChannelSettings |
     )
 
 
-def ranges(robot: Robot | None, limits: LimitSettings, motors: int = 3) -> tuple[tuple[float, float, float], ...]:
+def ranges(robot: Robot | None, limits: LimitSettings) -> tuple[tuple[float, float, float], ...]:
     """Return the tighter limits of robot and drives file for each motor: lowest, highest [rad], speed [rad/s]."""
     most = limits.position
     if robot is None:
-        return ((-most, most, limits.speed),) * motors
+        return ((-most, most, limits.speed),) * 3
     speeds = _speeds_of(robot)
     return tuple(
         (max(low, -most), min(high, most), min(speed, limits.speed))

@@ -98,9 +98,9 @@ class Objects:
             raise
         return True
 
-    def read_text(self, index: int, subindex: int = 0) -> str:
+    def read_text(self, index: int) -> str:
         """Return a text."""
-        data = self._call(index, subindex, lambda: self._client.upload(index, subindex))
+        data = self._call(index, 0, lambda: self._client.upload(index, 0))
         return data.decode("ascii", "ignore").strip("\0 ")
 
     def write(self, index: int, subindex: int, value: int) -> None:

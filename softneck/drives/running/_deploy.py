@@ -21,7 +21,7 @@ from ..master import Frame, Master
 from ..sensing._sources import Sensor
 from ._bus_loop import Session, run_session
 from ._pilot import LoopPilot, RunLog
-from ._virtual import Watch, simulated_plant
+from ._virtual import simulated_plant
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +96,6 @@ def run_simulated(
     neck: NeckParameters | None = None,
     report: Callable[[float], None] | None = None,
     hook: Callable[[VirtualLink], None] | None = None,
-    watches: Sequence[Watch] = (),
     **how: Any,
 ) -> DrivesResult:
     """Run the whole loop on simulated drives, in virtual time.
@@ -107,7 +106,7 @@ def run_simulated(
         neck: the virtual neck; if not given, that of the loop, else that of the robot.
         report: called now and then with the done fraction.
         hook: called after each bus cycle, to let things go wrong.
-        watches, how: see `Session`; of `files` a replay looks for "loop" and "controller".
+        how: see `Session`; of `files` a replay looks for "loop" and "controller".
 
     Raises:
         CheckFailedError: the pre-flight failed.
@@ -119,7 +118,7 @@ def run_simulated(
     virtual.set(**disturbances)
     link = VirtualLink(virtual)
     more = () if hook is None else (lambda _now, _in, _out, _tilt, _master: hook(link),)
-    return _run(deployed, pilot, Session(file=file, link=link, watches=(*watches, *more), **how), report)
+    return _run(deployed, pilot, Session(file=file, link=link, watches=more, **how), report)
 
 
 def run_on_bus(

@@ -237,9 +237,9 @@ def set_points_of_others(frames: Sequence[Frame], nodes: Collection[int]) -> str
     )
 
 
-def listen(link: Link, nodes: Collection[int], seconds: float = LISTEN) -> str:
+def listen(link: Link, nodes: Collection[int]) -> str:
     """Return a frame of another master while this one is silent; "" if there is none."""
-    until = link.now + seconds
+    until = link.now + LISTEN
     while link.now < until:
         frames = link.receive(until - link.now)
         found = foreign_master(frames) or set_points_of_others(frames, nodes)

@@ -14,13 +14,13 @@ from ._node import CanFrame
 
 _NO_MEASUREMENT = -(2**31)
 _RESOLUTION = math.radians(0.001)
+_SENSOR_NODE = 10
 
 
 def serve(
     bus: Any,
     neck: SimulatedDrives,
     *,
-    sensor_node: int = 10,
     stopped: Callable[[], bool] | None = None,
     report: Callable[[float, SimulatedDrives, int], None] | None = None,
 ) -> None:
@@ -29,7 +29,6 @@ def serve(
     Args:
         bus: an open bus of python-can.
         neck: drives and plant; of more than two outputs the first two are sent.
-        sensor_node: node of the inclinometer, which sends its slopes in a TPDO of its own (CiA 410, 0.001 deg).
         stopped: called in each cycle.
         report: called with (monotonic time, neck, row) whenever the drive in that row changes its power state.
     """
@@ -54,7 +53,7 @@ def serve(
             moved += 1
             if moved * cycle >= sampled * sample_time:
                 sampled += 1
-                slopes = _slopes(neck, now, sensor_node)
+                slopes = _slopes(neck, now)
                 _send(bus, [slopes] if neck.sensor != "silent" else [])
             _send(bus, neck.run((), moved * cycle))
             tell()
@@ -72,14 +71,15 @@ def serve(
             tell()
 
 
-def _slopes(neck: SimulatedDrives, now: float, node: int) -> CanFrame:
+def _slopes(neck: SimulatedDrives, now: float) -> CanFrame:
+    """Return a TPDO of the inclinometer (CiA 410, 0.001 deg)."""
     sample = neck.sample(now)
     # An inclinometer has one axis or two.
     angles = sample.values[:2]
     values = [
         round(angle / _RESOLUTION) if sample.valid and not math.isnan(angle) else _NO_MEASUREMENT for angle in angles
     ]
-    return CanFrame(0x180 + node, struct.pack(f"<{len(values)}i", *values))
+    return CanFrame(0x180 + _SENSOR_NODE, struct.pack(f"<{len(values)}i", *values))
 
 
 def _send(bus: Any, frames: list[CanFrame]) -> None:

@@ -37,8 +37,6 @@ def calibrate(
     cycle: float,
     sample_cycles: int,
     slack: float,
-    budget: Budget | None = None,
-    seed: int = 0,
     known_bias: float = _KNOWN_BIAS,
 ) -> Baseline:
     """Return the baseline of undisturbed motion.
@@ -50,8 +48,6 @@ def calibrate(
         motions: undisturbed; those without a loop at least 40 s in total.
         cycle: of the bus [s]; sample_cycles: bus cycles for one sample of the tilt.
         slack: tension below which a tendon is slack [N].
-        budget: of false alarms; `charts` and `step` are set here.
-        seed: of the bootstrap.
         known_bias: share of the largest slow error that the charts of the tilt allow without a fault; the bootstrap
             covers the rest.
 
@@ -81,8 +77,8 @@ def calibrate(
     whole = fit(known, cycle=cycle, sample_cycles=sample_cycles, slack=slack)
     runs = _loops(loops, replace(whole, tilt_bias=bias))
     charts = motor[0].shape[1] + tilt[0].shape[1] + 1 + (2 * runs[0].values.shape[1] if runs else 0)
-    shared = replace(budget or Budget(), charts=charts)
-    rng = np.random.default_rng(seed)
+    shared = Budget(charts=charts)
+    rng = np.random.default_rng(0)
     # If samples are missing at random, e^-h bounds the rate of false alarms (Basseville and Nikiforov, 5.2.2).
     seldom = -np.log(shared.rate / shared.charts * cycle * sample_cycles)
     whole = replace(whole, tilt_bias=bias, missing_threshold=float(seldom))

@@ -104,16 +104,12 @@ def check_linear(arrays: Mapping[str, Matrix], sizes: Mapping[str, int], *, leas
 _MAX_CONDITION = 1e8
 
 
-def arx_rows(
-    runs: Sequence[tuple[Matrix, Matrix]], na: int, nb: int, delay: int, *, lag: int | None = None
-) -> tuple[Matrix, Matrix]:
+def arx_rows(runs: Sequence[tuple[Matrix, Matrix]], na: int, nb: int, delay: int) -> tuple[Matrix, Matrix]:
     """Return phi(t-1) of Eq. 26 (rows, n) and y(t) (rows, ny) of all runs, without rows with a missed sample.
 
     Runs are outputs (time, ny), the modelled one first, and inputs (time, nu); the newest input is u(t - delay - 1).
-    `lag` rows are skipped at the start of each run, by default as many as needed.
     """
-    need = max(na, nb + delay)
-    first = need if lag is None else max(lag, need)
+    first = max(na, nb + delay)
     parts, targets = [], []
     for Y, U in runs:
         if len(Y) <= first:

@@ -67,7 +67,6 @@ BODY_CREEP_RATE = 4
 BODY_COUPLING = 5
 BODY_LOBES = 6  # two
 BODY_STOP = 8
-BODY_SIZE = 9
 # The largest bend of late is forgotten over 60 s of a neck's time, 300 time constants.
 _FORGET_RATE = 1.0 / 60.0
 # A stalled drive gives way as the bend does: 4 ms at 20 ms follow that closely enough.
