@@ -70,7 +70,7 @@ class Task:
     asked: TuneRequirements
     robot: Robot
     cocontraction: float | None = None
-    seed: int = 0
+    seed: int
     observer: Any = None
     drawn: tuple[str, ...] = ()
 

@@ -591,7 +591,7 @@ def test_the_radius_of_a_circle_is_that_of_its_last_turn_at_the_angles_of_the_pa
 @pytest.mark.parametrize("linear", [{"f": 1}, {"f": 1, "m": 2}])
 def test_a_design_is_for_the_one_linear_plant_or_for_all_in_their_order(linear: dict[str, int]) -> None:
     asked = make_tune_requirements({})
-    task = Task(digest="", linear=linear, own={}, asked=asked, robot=Robot.preset())
+    task = Task(digest="", linear=linear, own={}, asked=asked, robot=Robot.preset(), seed=0)
     assert task.plant == (1 if len(linear) == 1 else [1, 2])
 
 
