@@ -279,7 +279,7 @@ class Search:
             if best is None or best.level != levels[-1]:
                 return
             along = np.linalg.qr(rng.standard_normal((best.x.size, best.x.size)))[0]
-            near = [best.x + sign * away * direction for direction in along for sign in (1.0, -1.0)]
+            near = [x for step in away * along for x in (best.x + step, best.x - step)]
             self._judge_levels([self._candidate(spaces[best.kind], np.clip(x, 0.0, 1.0)) for x in near], levels, finals)
             if self.sort_candidates()[0] is best:
                 away /= 2.0

@@ -142,6 +142,7 @@ def test_what_is_written_asks_tune_and_verify_for_the_same_again(tmp_path: Path,
 def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
     asked = make_tune_requirements({}, stepping=False)
     assert asked.limit("step.rise_s") == NECK_RISE_S
+    assert asked.certificate.sim["necks"] == 0  # a built-in plant would decide nothing
     assert asked.limit("sim.rise_s") is None
 
 
