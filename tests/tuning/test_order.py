@@ -47,7 +47,7 @@ from softneck.verification._verify import Verdict
 
 from ..design.test_robots import BELLOWS, LEARNED
 from ..order import MEMBERS, check_worst, is_worse
-from ..verification.necks import linear_neck
+from ..verification.necks import family, linear_neck
 from .test_requirements import axis
 
 TS = 0.02
@@ -471,8 +471,8 @@ def test_every_plant_payload_direction_and_size_is_a_loop_and_a_circle_where_the
     for plant, kg in ((0, 0.0), (0, 0.5), (1, 1.0)):
         expected |= {Case(plant, kg, angle, noise=noisy) for angle in angles for noisy in (False, True)}
         expected |= {Case(plant, kg, angle, part=0.3, noise=True) for angle in (angles[0], angles[-1])}
-        expected |= {Case(plant, kg, noise=True, late=True)}
-        expected |= {Case(plant, kg, circle=True)} if robot == "neck" else set()
+        expected |= {Case(plant, kg, 0.0, 1.0, noise=True, late=True, circle=False)}
+        expected |= {Case(plant, kg, 0.0, 1.0, noise=False, late=False, circle=True)} if robot == "neck" else set()
     assert set(found) == expected
     assert len(found) == len(expected)
 
@@ -1214,12 +1214,18 @@ def test_a_step_over_an_observer_holds_where_every_loop_of_full_size_does(
     ready.all = every[2:]
     assert not _certify.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, bounds)
 
-    def fails(*_: Any) -> Any:
-        raise DataError("overflow")
-
+    # One that diverges is lost, whichever it is.
     ready.all = every
-    monkeypatch.setattr(_certify, "judge_loop", fails)
-    assert not _certify.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, bounds)
+    for fine in (0, 1):
+        told = iter([({"rise_s": 0.5}, None)] * fine)
+
+        def fails(_: Any, told: Any = told) -> Any:
+            if found := next(told, None):
+                return found
+            raise DataError("overflow")
+
+        monkeypatch.setattr(_certify, "judge_loop", fails)
+        assert not _certify.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, bounds)
 
 
 @pytest.mark.parametrize("holds", [[True], [False, True, True], [False, False, False], [False, False, False, True]])
@@ -1401,7 +1407,9 @@ def test_a_certificate_resumes_a_search_unless_little_speed_alone_fails_or_no_dr
     assert kept == {"axes.gain_margin": pytest.approx(2.2), "sim.overshoot_pct": 1.6}
     # What loops of a search say decides only where there are draws among them.
     item = Candidate("a", {}, np.zeros(1), "margins", {"sim.overshoot_pct": 9.0})
-    assert [v.requirement for v in _certify._failed_in_search(task, item)] == [LIMITS[1]]
+    assert [(v.requirement, v.value, v.holds) for v in _certify._failed_in_search(task, item)] == [
+        (LIMITS[1], 9.0, False)
+    ]
     task.drawn = ()
     assert _certify._failed_in_search(task, item) == []
 
@@ -1762,6 +1770,14 @@ class _Found:
     candidates: Any = ()
     assumed: Any = None
     observed: bool = False
+
+
+def test_four_draws_of_each_family_are_in_every_loop_of_a_search() -> None:
+    models = [linear_neck() for _ in range(9)]
+    draws: Any = SimpleNamespace(for_search=lambda count: models[:count], conditions={"payload_kg": [0.0]})
+    task = task_of({"f": replace(family(), draws=draws), "g": family()}, {}, 0)
+    assert task.own == {f"f, draw {k + 1}": models[k] for k in range(4)}
+    assert task.drawn == tuple(task.own)
 
 
 @pytest.mark.parametrize("loads", [[[0.0, 0.5], [0.2, 1.0]], [[1.0, 0.2], [0.5, 0.0]]])
