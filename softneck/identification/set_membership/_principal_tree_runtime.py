@@ -27,8 +27,9 @@ def tree_cones(points: np.ndarray, first: int, count: int, gamma: float, x: np.n
         cones[k] = 0.0
     for i in range(x.shape[0]):
         value = x[i]
+        side = points[i, first : first + count]  # of indices from 0 on numba makes vectors
         for k in range(count):
-            gap = points[i, first + k] - value
+            gap = side[k] - value
             cones[k] += gap * gap
     for k in range(count):
         cones[k] = gamma * math.sqrt(cones[k])
@@ -93,10 +94,10 @@ def slant_leaf(
     tree_cones(points, first, count, gamma, x, cones)
     low = best[0]
     high = best[1]
+    there = values[first : first + count]
     for k in range(count):
-        value = values[first + k]
-        high = min(high, value + cones[k])
-        low = max(low, value - cones[k])
+        high = min(high, there[k] + cones[k])
+        low = max(low, there[k] - cones[k])
     best[0] = low
     best[1] = high
 
