@@ -222,43 +222,17 @@ def least_gamma(plant: Partition) -> float:
     Raises:
         SettingsError: none up to 1e8.
     """
-    solve, lost, kept, sizes = _riccati_pair(plant), 0.0, math.inf, dict[float, float]()
-
-    def holds(gamma: float) -> bool:
-        """Return whether a controller exists: it does above a gamma that has one, and not below one without."""
-        nonlocal lost, kept
-        if lost < gamma < kept:
-            found = solve(gamma)
-            if found is None:
-                lost = gamma
-            else:
-                kept, sizes[gamma * gamma] = gamma, float(np.abs(found[0]).max(initial=0.0))
-        return gamma >= kept
-
-    low, high = 0.0, 1.0
-    while not holds(high):
+    solve, low, high = _riccati_pair(plant), 0.0, 1.0
+    while solve(high) is None:
         low, high = high, 4.0 * high
         if high > _MAX_GAMMA:
             raise SettingsError(
                 "no controller exists for any gamma: the plant cannot be stabilised, or a weight is not stable."
             )
     while high - low > _GAMMA_TOLERANCE * high and high >= 1e-8:
-        if len(sizes) == 3:
-            # Both sides of where X is infinite: what is halved afterwards is known.
-            least = _pole(*sizes.items())
-            sizes.clear()
-            for factor in (1.0 + 0.1 * _GAMMA_TOLERANCE, 1.0 - 0.1 * _GAMMA_TOLERANCE):
-                holds(factor * math.sqrt(max(least, 0.0)))
         middle = 0.5 * (low + high) if low > 0.0 else 0.25 * high
-        low, high = (low, middle) if holds(middle) else (middle, high)
+        low, high = (middle, high) if solve(middle) is None else (low, middle)
     return high
-
-
-def _pole(*points: tuple[float, float]) -> float:
-    """Return the pole p of `a + b/(x - p)` through three points."""
-    (x0, y0), (x1, y1), (x2, y2) = points
-    ratio = (y0 - y1) * (x2 - x1) / ((y1 - y2) * (x1 - x0)) if y1 != y2 else 1.0
-    return (ratio * x0 - x2) / (ratio - 1.0) if ratio != 1.0 else 0.0
 
 
 def _riccati_pair(plant: Partition) -> Callable[[float], tuple[Matrix, Matrix, Matrix, Matrix] | None]:
