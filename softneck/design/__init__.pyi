@@ -26,7 +26,6 @@ from .varying._adaptive import VaryingController as VaryingController
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
 from ._design import linear_plant as linear_plant
-from .linear._axis_loop import grid_response as grid_response
 from .linear._axis_loop import least_rise as least_rise
 from .linear._controller import assumed_lines as assumed_lines
 from .linear._margins import LoopMargins as LoopMargins
@@ -39,5 +38,6 @@ from .linear._ports import motor_ranges as motor_ranges
 from .linear._settings import AxisSettings as AxisSettings
 from .linear._settings import LoopSettings as LoopSettings
 from .linear._settings import axis_test as axis_test
+from .plants._coupled import grid_response as grid_response
 from .plants._uncertain import UncertainPlant as UncertainPlant
 from .robust._mu import two_scalars as two_scalars

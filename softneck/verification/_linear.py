@@ -70,7 +70,7 @@ class LinearLaw:
 
     def feedback(self, frequency: Vector) -> np.ndarray:
         """Return Ky (m, axes, axes) at `frequency` [rad/s]."""
-        return self._response(frequency, self.By, self.Dy)
+        return grid_response(self.A, self.By, self.C, self.Dy, np.exp(1j * frequency * self.sample_time))
 
     @property
     def coupled(self) -> bool:
@@ -79,9 +79,6 @@ class LinearLaw:
         # 1e-9: rounding of an allocation that is diagonal.
         others = Ky[:, ~np.eye(Ky.shape[1], dtype=bool)].sum(axis=1)
         return bool(others.max() > 1e-9 * Ky.max())
-
-    def _response(self, frequency: Vector, B: Matrix, D: Matrix) -> np.ndarray:
-        return grid_response(self.A, B, self.C, D, np.exp(1j * frequency * self.sample_time))
 
 
 def frequency_grid(sample_time: float, time: float = 1.0, points: int = 360) -> Vector:

@@ -170,6 +170,25 @@ def radius(parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: AnyAxes, extra_
     return float(np.abs(np.linalg.eigvals(close_loop(parts, plants, extra_delay)[0])).max())
 
 
+def grid_response(A: Matrix, B: Matrix, C: Matrix, D: Matrix, z: np.ndarray) -> np.ndarray:
+    """Return `C (z - A)^-1 B + D` (m, outputs, inputs) at each z (m,)."""
+    n = len(A)
+    if n == 0:
+        return np.broadcast_to(D.astype(complex), (z.size, *D.shape))
+    if z.size <= n:
+        return C @ np.linalg.solve(z[:, None, None] * np.eye(n) - A, np.broadcast_to(B, (z.size, *B.shape))) + D
+    from scipy.linalg import schur
+
+    # A grid: one Schur form, then all points by back substitution, a tenth of the time of a solve at each.
+    form: Any = schur(A, output="complex")
+    triangle, basis = form
+    right, states = basis.conj().T @ B, np.empty((n, B.shape[1], z.size), complex)
+    for k in range(n - 1, -1, -1):
+        later = np.tensordot(triangle[k, k + 1 :], states[k + 1 :], 1)
+        states[k] = (right[k][:, None] + later) / (z - triangle[k, k])
+    return np.moveaxis(np.tensordot(C @ basis, states, 1), -1, 0) + D
+
+
 def sensitivity(
     parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: AnyAxes, extra_delay: int, frequency: Vector
 ) -> float:
@@ -177,13 +196,7 @@ def sensitivity(
     A, B, C, D = parts
     m = len(plants)
     z = np.exp(1j * frequency * plants[0].sample_time)
-    values, V = np.linalg.eig(A)
-    if np.linalg.cond(V) < 1e8:
-        left, right = C @ V, np.linalg.solve(V, B[:, m:].astype(complex))
-        K = np.einsum("on,kn,ni->koi", left, 1.0 / (z[:, None] - values), right) + D[:, m:]
-    else:
-        eye = np.eye(A.shape[0])
-        K = np.array([C @ np.linalg.solve(point * eye - A, B[:, m:]) + D[:, m:] for point in z])
+    K = grid_response(A, B[:, m:], C, D[:, m:], z)
     if all(isinstance(plant, AxisPlant) for plant in plants):
         own = np.array([plant.response(frequency, extra_delay=extra_delay) for plant in plants]).T
         loop = own[:, :, None] * K

@@ -11,8 +11,9 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_between, require_positive
 
-from ..linear._axis_loop import error_feedback, grid_response
+from ..linear._axis_loop import error_feedback
 from ..linear._settings import AxisDesign, AxisSettings
+from ..plants._coupled import grid_response
 from ..plants._uncertain import UncertainAxis
 from ._weights import makeweight, to_continuous, to_discrete, weight_image
 
