@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -135,16 +134,12 @@ def _is(value: Any, schema: Any) -> bool:
     if schema is None:
         return value is None
     if schema is float:
-        return isinstance(value, int | float) and not isinstance(value, bool) and _is_finite(value)
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST
     if schema is int:
         return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= _LARGEST_COUNT
     if isinstance(schema, list):
         return isinstance(value, list)
     return isinstance(value, Mapping if isinstance(schema, dict) else schema)
-
-
-def _is_finite(value: float) -> bool:
-    return abs(value) <= _LARGEST and math.isfinite(value)
 
 
 def _words(schema: Any) -> str:

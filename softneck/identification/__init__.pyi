@@ -7,7 +7,6 @@ from .linear._rls import Rls as Rls
 from .models._drive import fit_drive as fit_drive
 from .models._model import WARM_UP as WARM_UP
 from .models._model import Model as Model
-from .models._model import load_model as load_model
 from .models._regressors import PAPER_EQ21 as PAPER_EQ21
 from .models._scores import nrmse_fit as nrmse_fit
 from .networks._network import Network as Network

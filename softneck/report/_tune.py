@@ -189,12 +189,9 @@ def tune_decision(found: Tuned, *, tuner: str | None = TUNER) -> str:
            "drives": has_drives((robot.motors.unit, robot.outputs.unit)),
            **verdict_values(_verdict_rows(found))}  # fmt: skip
     said = certificate_decision(one, tuner=tuner)
-    said = f"{said} {_loosened_words(found)}" if found.holds and found.loosened else said
+    if found.holds and found.loosened:
+        said += f" Loosened: {'; '.join(one.in_words(metric) for metric, one in found.loosened.items())}."
     return said if tuner is None else f"{said} {faster_words(faster_values(found), tuner)}".rstrip()
-
-
-def _loosened_words(found: Tuned) -> str:
-    return f"Loosened: {'; '.join(one.in_words(metric) for metric, one in found.loosened.items())}."
 
 
 def _verdict_rows(found: Tuned) -> list[dict[str, Any]]:

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from softneck.core import load
 from softneck.design import PiSettings
-from softneck.identification import OutputError, Rls, load_model
+from softneck.identification import OutputError, Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import read_recording, signal, write_recording
 
@@ -37,8 +38,8 @@ def test_the_model_that_is_written_is_that_of_python(call: Call, folder: Path) -
     told = json.loads(said.out)
     assert told["adapted"]
     assert told["fit_after"][0] >= told["fit_before"][0]
-    expected = load_model(folder / "oe.npz").adapt(read_recording(folder / "today.csv"))
-    for name, array in load_model("new.npz").arrays.items():
+    expected = load(folder / "oe.npz").adapt(read_recording(folder / "today.csv"))
+    for name, array in load("new.npz").arrays.items():
         np.testing.assert_array_equal(array, expected.arrays[name])
 
 
@@ -46,8 +47,8 @@ def test_a_model_that_is_kept_is_said_to_be(call: Call, folder: Path) -> None:
     said = call("identify", "oe", folder / "still.csv", "--from", folder / "oe.npz", "-o", "new.npz")
     assert said.code == 0, said.err
     assert "the old model, kept: the window hardly moves the neck" in said.out
-    for name, array in load_model("new.npz").arrays.items():
-        np.testing.assert_array_equal(array, load_model(folder / "oe.npz").arrays[name])
+    for name, array in load("new.npz").arrays.items():
+        np.testing.assert_array_equal(array, load(folder / "oe.npz").arrays[name])
 
 
 def test_what_cannot_be_adapted_is_one_line_and_no_file(call: Call, folder: Path) -> None:

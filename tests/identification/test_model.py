@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError, load
-from softneck.identification import WARM_UP, Model, embed_model, embedded_model, load_model
+from softneck.identification import WARM_UP, Model, embed_model, embedded_model
 from softneck.signals import Recording, concatenate
 
 from ..data import TS, neck_recording
@@ -86,7 +86,7 @@ def test_runs_are_simulated_one_by_one(models: dict[str, Model], kind: str) -> N
 def test_a_file_keeps_every_bit(models: dict[str, Model], kind: str, tmp_path: Path) -> None:
     model = models[kind]
     model.save(tmp_path / "m.npz")
-    back = load_model(tmp_path / "m.npz")
+    back = load(tmp_path / "m.npz")
     assert list(back.arrays) == list(model.arrays)
     assert all(back.arrays[name].tobytes() == model.arrays[name].tobytes() for name in model.arrays)
     assert back.simulate(UNSEEN).tobytes() == model.simulate(UNSEEN).tobytes()
@@ -136,7 +136,7 @@ def test_a_crafted_file_never_reaches_the_compiled_code(
     arrays[name] = np.ascontiguousarray(change(arrays[name]))
     Model(kind=models[kind].kind, sample_time=TS, arrays=arrays).save(tmp_path / "m.npz")
     with pytest.raises(FileFormatError, match=message):
-        load_model(tmp_path / "m.npz")
+        load(tmp_path / "m.npz")
 
 
 def test_another_sample_time_is_refused(models: dict[str, Model]) -> None:

@@ -94,9 +94,6 @@ class CustomSettings(AxisSettings):
         )
         return multivariable_controller(self, made, robot, filtered=False)
 
-    def _controller_of(self, name: str) -> Any:
-        return self.controller[name] if isinstance(self.controller, Mapping) else self.controller
-
     def _is_shared(self) -> bool:
         return not isinstance(self.controller, Mapping)
 
@@ -107,7 +104,7 @@ class CustomSettings(AxisSettings):
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:
         import control
 
-        K = self._controller_of(name)
+        K = self.controller[name] if isinstance(self.controller, Mapping) else self.controller
         _require_sample_time(K, axis.sample_time)
         made = error_feedback(control.ss(K)) if K.ninputs == 1 else _two_input_axis(K, name)
         return AxisDesign(made, {}, {"imported": True, **_remark_slow_loop(made, axis)})

@@ -55,7 +55,6 @@ class LqgSettings(AxisSettings):
         )
 
     def _design_coupled(self, plant: CoupledPlant) -> LinearController:
-        """Return the controller of a coupled plant."""
         uncertainty = default_uncertainty(plant.robot)
         nominal: AnyAxes = tuple(row.with_min_delay(uncertainty.least_delay) for row in plant.rows)
         spread = {1.0, 1.0 - uncertainty.gain_spread, 1.0 + uncertainty.gain_spread}

@@ -244,7 +244,6 @@ class AxisSettings(LoopSettings, ABC):
         return True
 
     def _settings_json(self) -> dict[str, Any]:
-        """Return the settings as JSON values."""
         return asdict(self)
 
     def _prepare_axis(self, axis: UncertainAxis) -> UncertainAxis:

@@ -416,7 +416,7 @@ def _of_system(system: Any, axis: str) -> Any:
             raise SettingsError(f"the system is that of {label} alone; give both, as {{'pitch': ..., 'roll': ...}}.")
         return system
     inputs, outputs = list(system.input_labels), list(system.output_labels)
-    if len(inputs) == len(outputs) == 2 and all(_is_default_name(name) for name in (*inputs, *outputs)):
+    if len(inputs) == len(outputs) == 2 and all(name.startswith(("u[", "y[")) for name in (*inputs, *outputs)):
         i = AXES.index(axis)
         return system[i, i]
     if _INPUTS[axis] not in inputs or axis not in outputs:
@@ -426,10 +426,6 @@ def _of_system(system: Any, axis: str) -> Any:
             "`custom` take systems of any size."
         )
     return system[outputs.index(axis), inputs.index(_INPUTS[axis])]
-
-
-def _is_default_name(label: str) -> bool:
-    return label.startswith(("u[", "y["))
 
 
 # Of the paper's loop [s].

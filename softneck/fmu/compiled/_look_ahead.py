@@ -86,7 +86,7 @@ def _step_response(block: Block, motor: int, samples: int) -> Matrix:
     """Return the outputs (samples, n_out) after a step of one set-point at row 0; where they diverge they stay."""
     port, runtime = block.inputs[motor], load_runtime(block.runtime, compiled=False)
     limits = [x for x in (port.minimum, port.maximum) if x is not None and np.isfinite(x)]
-    u = _inputs_at_rest(block)
+    u = np.array([math.nan if port.missing else port.start for port in block.inputs])  # at rest
     u[motor] = max(limits, key=abs, default=1.0) or 1.0
     q, x, y = _parameters(block, longest=True), np.zeros(runtime.state_size(block.arrays)), np.zeros(len(block.outputs))
     runtime.initialise(block.arrays, q, x, y)
@@ -99,10 +99,6 @@ def _step_response(block: Block, motor: int, samples: int) -> Matrix:
                 break
             found[k] = y
     return found
-
-
-def _inputs_at_rest(block: Block) -> Vector:
-    return np.array([math.nan if port.missing else port.start for port in block.inputs])
 
 
 def _parameters(block: Block, *, longest: bool) -> Vector:

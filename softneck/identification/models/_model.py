@@ -27,7 +27,6 @@ from softneck.core import (
     to_si,
     write_archive,
 )
-from softneck.core import load as load_file
 from softneck.robot import Robot
 from softneck.runtime import Block, State
 from softneck.signals import Labelled, Recording, RecordingLike, open_recording, require_same_robot
@@ -414,11 +413,6 @@ class Model(ReprMixin):
             )
         if len(recording) < 2:
             raise DataError(f"a run needs at least 2 rows; got {len(recording)}.")
-
-
-def load_model(path: str | Path) -> Model:
-    """Open a model file; raises FileFormatError for anything else."""
-    return load_file(path, role="model")
 
 
 def _input_rows(run: Recording, source: str, *, outputs: bool = True) -> Matrix:

@@ -171,7 +171,6 @@ def _explain_agreement(ranking: Sequence[KindTrial]) -> str:
 
 
 def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[str, ...]:
-    """Return the warnings on a ranking."""
     remarks = []
     if not other_excitation:
         remarks.append(

@@ -143,7 +143,6 @@ def _raw_log(source: Path, layout: Layout) -> pd.DataFrame:
 
 
 def _columns(layout: Layout) -> tuple[Column, ...]:
-    """Return all columns that a layout names."""
     sources = [*layout.channels.values(), layout.inclination, layout.orientation, layout.time]
     named = [term.column for source in sources if source is not None for term in source.terms]
     q = layout.quaternion

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from softneck.core import DataError, SettingsError
+from softneck.core import DataError, SettingsError, load
 from softneck.identification import (
     WARM_UP,
     GreyBox,
@@ -16,7 +16,6 @@ from softneck.identification import (
     OutputError,
     Play,
     Rls,
-    load_model,
     nrmse_fit,
 )
 from softneck.identification._adapt import (
@@ -92,7 +91,7 @@ def test_an_adapted_model_follows_the_neck_it_saw_and_is_better_on_a_run_it_did_
     again = loaded("rotation", 1.0, 8)
     assert sum(fits(new, again)) > sum(fits(old[kind], again)) + 1.0
     new.save(tmp_path / "new.npz")
-    np.testing.assert_array_equal(load_model(tmp_path / "new.npz").simulate(again), new.simulate(again))
+    np.testing.assert_array_equal(load(tmp_path / "new.npz").simulate(again), new.simulate(again))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -12,8 +12,8 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from softneck.core import SettingsError, Vector
-from softneck.identification import OutputError, load_model
+from softneck.core import SettingsError, Vector, load
+from softneck.identification import OutputError
 from softneck.identification.linear._srivc_fit import Continuous, SrivcFitOptions
 from softneck.signals import SET_POINTS, Recording, motors_from, redefine, signal
 
@@ -142,7 +142,7 @@ def test_intervals_are_around_the_model_and_in_its_file(tmp_path: Path) -> None:
         assert bounds["delay_s"][0] - 1e-3 < model.arrays["delay"][axis] * TS < bounds["delay_s"][1] + 1e-3
     assert "of a nonlinear neck vary more" in model.summary()
     model.save(tmp_path / "m.npz")
-    assert load_model(tmp_path / "m.npz").findings["intervals"] == model.findings["intervals"]
+    assert load(tmp_path / "m.npz").findings["intervals"] == model.findings["intervals"]
     plain = OutputError(max_delay=0.12).fit(recording)
     assert "intervals" not in plain.findings
     assert all(plain.arrays[name].tobytes() == model.arrays[name].tobytes() for name in plain.arrays)

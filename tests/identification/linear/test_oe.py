@@ -12,8 +12,8 @@ import scipy.signal as dsp
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from softneck.core import DataError, SettingsError
-from softneck.identification import OutputError, Rls, load_model, validate
+from softneck.core import DataError, SettingsError, load
+from softneck.identification import OutputError, Rls, validate
 from softneck.identification.linear._oe import fit_output_error
 from softneck.identification.models._linear_systems import continuous_parameters
 from softneck.robot import Robot
@@ -126,7 +126,7 @@ def test_what_drives_it_is_what_was_asked(source: str) -> None:
 def test_tf_ss_free_run_and_file_are_one_system(settings: OutputError, tmp_path: Path) -> None:
     model = settings.fit(neck_recording(1500, noise=1e-3))
     model.save(tmp_path / "m.npz")
-    model = load_model(tmp_path / "m.npz")
+    model = load(tmp_path / "m.npz")
     P = signal("aprbs", duration=6.0, seed=8).set_points.copy()
     P[:12] = 0.0  # from rest: control's systems start there
     free = model.simulate(recording_from(P), warm_up=0)
