@@ -165,7 +165,7 @@ def kalman_push(p: KalmanArrays, x: KalmanState, inputs: np.ndarray, u: np.ndarr
             lost = lost or not math.isfinite(rate)
             held = held and bool(rate == x.rates[i])
         # With an invalid measurement, an unchanged rate is an old one that is held.
-        lost = lost or bool(inputs[valid] < 0.5 and x.samples > 0.0 and held)
+        lost = lost or bool(not inputs[valid] > 0.5 and x.samples > 0.0 and held)
         if not lost:
             x.rates[:] = inputs[valid + 1 :]
         # Missing rates leave the last ones; `step` increases P for the angle's motion in between.

@@ -126,6 +126,15 @@ def test_invalid_measurements_are_ignored_whatever_they_say() -> None:
     assert np.isfinite(missing.values).all()
 
 
+@pytest.mark.parametrize("form", ["model", "gyro"])
+def test_a_validity_of_a_half_is_none_for_angles_and_for_rates_that_are_held(form: Any) -> None:
+    block = KalmanSettings(form=form).design(neck()).block()
+    rates = [0.02, -0.01] * (form == "gyro")
+    state, _ = block.step(block.initial_state(), [0.0, 0.0, 0.0, 0.1, 0.0, 1.0, *rates])
+    none, half = (block.step(state, [0.0, 0.0, 0.0, 0.7, 0.7, valid, *rates])[0].values for valid in (0.0, 0.5))
+    np.testing.assert_array_equal(half, none)
+
+
 def test_pause_and_resume_equals_one_run() -> None:
     block = KalmanSettings().design(neck()).block()
     U = np.random.default_rng(2).standard_normal((50, 6)) * 0.1 + np.array([0, 0, 0, 0, 0, 1.0])
