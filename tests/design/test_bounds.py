@@ -254,8 +254,9 @@ def test_the_last_kept_is_that_of_all_halvings_by_fewer_tries(curve: Callable[[f
         assert low <= min(tried)
         assert max(tried) < high
         counts.append(len(tried))
-    # Four tries may have followed nothing. Of a line in log(x) two halvings and both ends of an interval are tried.
-    assert max(counts) <= halvings + 4
+    # Beside the lowest, four tries may have followed nothing. Of a line in log(x) two halvings and both ends of an
+    # interval are tried.
+    assert max(counts) <= halvings + 5
     assert (curve(-2.0), curve(2.0)) != (-2.0, 2.0) or np.mean(counts) < 0.6 * halvings
 
 
