@@ -41,7 +41,7 @@ class Synthesis:
     achieved: float
 
 
-def mixsyn(G: Any, W1: Any = None, W2: Any = None, W3: Any = None) -> Synthesis:
+def mixsyn(G: Any, W1: Any = None, W2: Any = None, W3: Any = None, *, above: float = _GAMMA_FACTOR) -> Synthesis:
     """Return the controller that keeps `|W1 S; W2 K S; W3 T|` small (Skogestad and Postlethwaite 2005, sec. 9.3.6).
 
     Args:
@@ -50,6 +50,7 @@ def mixsyn(G: Any, W1: Any = None, W2: Any = None, W3: Any = None) -> Synthesis:
         W1, W2, W3: None, numbers or stable systems, continuous or of the plant's dt: of as many inputs as the plant
             has outputs (W1, W3) or inputs (W2), or scalar ones, which weigh each of the signals alike. Continuous
             weights of a discrete plant act at `2/Ts tan(w Ts/2)`.
+        above: the controller is built at this factor above the least gamma.
 
     Raises:
         SettingsError: no weight, one that cannot be solved for, another dt, or no controller.
@@ -65,7 +66,7 @@ def mixsyn(G: Any, W1: Any = None, W2: Any = None, W3: Any = None) -> Synthesis:
             "the control effort is not weighted at high frequencies (D12 has not full rank), where the search for a "
             "controller hangs: give W2 a gain there, a number for example, or a W3 with as many zeros as poles."
         )
-    found = hinfsyn(_augment(to_continuous(G), weights), outputs, inputs)
+    found = hinfsyn(_augment(to_continuous(G), weights), outputs, inputs, above=above)
     K = to_discrete(found.controller, dt) if dt else found.controller
     return Synthesis(controller=_name_signals(K, G, dt), gamma=found.gamma, achieved=found.achieved)
 
