@@ -89,6 +89,9 @@ def main() -> None:
         print(f"{'command':16}{'times':13}" + "".join(f"{f'{n} x [s]':>10}" for n in asked.sizes) + "  exponent   last")
         for name in asked.names or known:
             grows, command = known[name]
+            for n in asked.sizes if name == "verify" else ():
+                if not Path(f"{n}.family.npz").is_file():
+                    softneck(known["family --draws"][1](n))
             softneck(f"{command(asked.sizes[0])} --force")
             costs = [softneck(f"{command(n)} --force") - start for n in asked.sizes]
             told = "".join(f"{cost:10.2f}" for cost in costs)
