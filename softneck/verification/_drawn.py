@@ -210,13 +210,13 @@ def _run_all(
                     failed.add(number)
     # A gain raised and one lowered are two margins: the slow loop of a lower gain swings longer, and may never fail.
     kinds = dict.fromkeys((item.metric, item.experiment.what) for _, margins in results for item in margins)
-    for metric, kind in kinds:
-        alike = [[m for m in margins if (m.metric, m.experiment.what) == (metric, kind)] for _, margins in results]
-        for items in sorted(alike, key=_severity)[:_BISECTED]:
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        for metric, kind in kinds:
+            alike = [[m for m in margins if (m.metric, m.experiment.what) == (metric, kind)] for _, margins in results]
             progress(0.95, f"bisect {metric}")
-            value, item = _least_margin(items)
-            values.setdefault(metric, []).append(value)
-            conditions.setdefault(metric, []).append(_margin_facts(item, plants[item.number].name, asked))
+            for value, item in pool.map(_least_margin, sorted(alike, key=_severity)[:_BISECTED]):
+                values.setdefault(metric, []).append(value)
+                conditions.setdefault(metric, []).append(_margin_facts(item, plants[item.number].name, asked))
     return Drawn(
         name, draws, attempt, len(plants), {metric: np.array(found) for metric, found in values.items()}, conditions,
         tuple(sorted(failed)),
