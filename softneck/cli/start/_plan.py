@@ -11,7 +11,7 @@ from math import isclose
 from pathlib import Path
 
 from softneck import signals
-from softneck.core import MOST_TOML, SettingsError, settings_text
+from softneck.core import MOST_TOML, SettingsError, load, settings_text
 from softneck.robot import Robot
 
 from ..shared._console import note
@@ -244,7 +244,10 @@ def _controller(options: Options) -> Iterator[Step]:
 
     family = Path(FAMILY).is_file()
     linear, nonlinear = FAMILY if family else linear_model(), nonlinear_model()
-    plants = (linear, nonlinear or linear_model()) if family or nonlinear else (linear,)
+    plant = nonlinear or linear_model()
+    # Where draws decide, a nonlinear model that predicts worse than the linear one has no say.
+    beside = AUTO if family and load(FAMILY).draws is not None else plant
+    plants = (linear, beside) if family or nonlinear else (linear,)
     kinds = options.kinds or (_CONTROLLER_KINDS if family else _CONTROLLER_KINDS + _KINDS_WITHOUT_FAMILY)
     # Requirements of the user stay; infeasible defaults are left out, and the step fails.
     finding = possible(plants) if options.requirements is None else ""
@@ -256,7 +259,7 @@ def _controller(options: Options) -> Iterator[Step]:
     # --force continues the same search, and replaces another one. In this process: with empty caches each further
     # process compiles the same again, which takes most of the time of 80 evaluations.
     command = ("softneck", "tune", *plants, *words, "--observer", OBSERVER, "--workers", "0", "-o", "tune", "--force")
-    fmus = _fmus(plants[-1], options)
+    fmus = _fmus(plant, options)
     yield Step(stage="tune", command=command, makes=(BEST, _TUNED_LOOP, "tune/report.html", TUNER),
                reads=(*plants, OBSERVER, *wanted), finding=finding, beside=tuple(fmus[:2]))  # fmt: skip
     eyes = (OBSERVER,) if uses_observer() else ()
