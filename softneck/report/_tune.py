@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from softneck.verification import Requirement
 
 BEST, OBSERVER, CERTIFICATE, LOOP = "best.npz", "observer.npz", "best.certificate.json", "loop.toml"
-TUNER = "tuner.html"
+TUNER, PLANT = "tuner.html", "plant.npz"
+_DRAWN = "the model of the draws"
 _LOOP_AT, _LOOP_TAUT = 1.0, 3.0
 
 
@@ -63,7 +64,7 @@ def write_tuned(found: Tuned, folder: Path, plants: Mapping[str, Path]) -> dict[
         write_certificate(certificate, verification.contents(further=more), force=True)
     else:
         certificate.unlink(missing_ok=True)
-    _write_loop(found, folder, steps)
+    _write_loop(found, folder, steps or _write_drawn(found, folder))
     values = tuned_values(found, folder / BEST)
     _write(folder / "pareto.json", json.dumps(values["pareto"], indent=1) + "\n")
     _write(folder / "pareto.csv", _csv(found))
@@ -111,8 +112,17 @@ def _csv(found: Tuned) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _write_drawn(found: Tuned, folder: Path) -> dict[str, Path]:
+    """Write the model of the draws that decide, if any, as a plant of the loop, and return it by its name."""
+    for thing in found.task.linear.values() if found.task.drawn else ():
+        if getattr(thing, "draws", None) is not None:
+            thing.draws.model.save(folder / PLANT, force=True)
+            return {_DRAWN: folder / PLANT}
+    return {}
+
+
 def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> None:
-    """Write a loop file with the best controller and the first simulation model, else the nominal linear model."""
+    """Write a loop file with the best controller and the first of `steps`, else the nominal linear model."""
     task = found.task
     robot = task.robot
     if not steps:
@@ -138,7 +148,7 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
         "controller": {"file": BEST},
         "reference": {"kind": "step", f"{first}_{unit}": start + float(neck["size_deg"]), "at_s": at},
     }
-    if any(plant.payload and plant.name == name for plant in found.own):
+    if any(plant.payload and (plant.name == name or name == _DRAWN) for plant in found.own):
         table["plant"]["parameters"] = {"payload": float(max(neck["payloads_kg"]))}
     if taut and "least_cocontraction" not in found.best.settings:
         table["reference"]["cocontraction"] = task.said_cocontraction

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softneck.core import write_certificate
+from softneck.core import load, write_certificate
 from softneck.identification import INFINITE, Validation, validate
 from softneck.report import decision_values, project_page, read_project, validation_page
 from softneck.report._decisions import (
@@ -25,6 +25,7 @@ from softneck.report._decisions import (
     project_decision,
     validation_decision,
 )
+from softneck.report._tune import _write_drawn
 from softneck.report._tuner import faster_values, faster_words
 from softneck.robot import Robot
 from softneck.tuning import Candidate
@@ -318,3 +319,19 @@ def test_the_page_opens_with_the_decision_whose_figures_are_in_the_json(judged: 
                 row[1]
             ]
             assert row[-1] == fit_word(fit)
+
+
+def test_a_loop_without_simulation_model_is_over_the_model_of_the_draws(tmp_path: Path) -> None:
+    """Those of the first family with draws, and only where draws decide."""
+    model = load(GOLDEN / "greybox.npz")
+    family = SimpleNamespace(draws=SimpleNamespace(model=model))
+    linear = {"rls.npz": SimpleNamespace(), "box.npz": SimpleNamespace(draws=None), "family.npz": family}
+    found: Any = SimpleNamespace(task=SimpleNamespace(drawn=(), linear=linear))
+    assert _write_drawn(found, tmp_path) == {}
+    assert list(tmp_path.iterdir()) == []
+    found.task.drawn = ("family.npz, draw 1",)
+    ((_, path),) = _write_drawn(found, tmp_path).items()
+    assert path.parent == tmp_path
+    copied = load(path)
+    assert copied.kind == "greybox"
+    assert all(np.array_equal(copied.arrays[name], values) for name, values in model.arrays.items())

@@ -8,6 +8,7 @@ import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -165,8 +166,21 @@ def test_a_family_that_cannot_be_made_is_done_without_and_none_of_other_recordin
     Path("models").mkdir()
     Path(_plan.FAMILY).touch()
     assert call("robot", "new", "robot.toml", "--preset", "neck").code == 0
-    beside = next(_plan._controller(Options(logs=()))).command
-    assert beside[2:6] == (_plan.FAMILY, "models/auto.npz", "--kinds", "pi,pid,fopi,hinf,lqg")
+    cases = [(None, None, "auto.npz"), ("draws", "nonlinear", "auto.npz"), (None, "nonlinear", "auto_nonlinear.npz"),
+             ("draws", "linear", "auto.npz")]  # fmt: skip
+    for draws, other, second in cases:
+        # The better model stands in auto.npz, the best of the other sort beside it.
+        family = SimpleNamespace(draws=draws)
+        monkeypatch.setattr(_plan, "load", {Path(_plan.FAMILY): family, _plan.FAMILY: family}.get)
+        others = [Path("models", f"auto_{other}.npz")] * (other is not None)
+        for path in others:
+            path.touch()
+        beside = next(_plan._controller(Options(logs=())))
+        assert beside.command[2:6] == (_plan.FAMILY, f"models/{second}", "--kinds", "pi,pid,fopi,hinf,lqg")
+        plant = beside.beside[0].command[2]
+        assert plant == ("models/auto_nonlinear.npz" if other == "nonlinear" else "models/auto.npz")
+        for path in others:
+            path.unlink()
 
 
 @pytest.mark.parametrize("bad", ["yaw", "roll"])
