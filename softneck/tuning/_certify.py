@@ -149,7 +149,13 @@ def _verify_best(
 ) -> tuple[Certified, int]:
     """Return the first of the best whose certificate holds, else the best, and the number of verifications so far."""
     compared, found = compared_candidates(search), []
-    promising = [item for item in compared if search.cost(item) <= 1.0][:_MAX_VERIFICATIONS] or compared[:1]
+    # Those that hold on all draws of the search come first, then those that hold on the few of every loop; of each kind
+    # the best first, as its neighbours miss the same.
+    task = search.task
+    promising = [
+        item for item in best_of_kinds(compared)
+        if search.cost(item) <= 1.0 or (item.level == LEVELS[-1] and item.holds(task.bounds, tested=task.tested))
+    ][:_MAX_VERIFICATIONS] or compared[:1]  # fmt: skip
     for number, item in zip(range(tried + 1, most_attempts(search.task) + 1), promising, strict=False):
         progress((number - tried - 1) / len(promising), f"verify {item.kind}")
         found.append(certify(search.task, item, files, number, relaxations(item, (), search.task.asked)))

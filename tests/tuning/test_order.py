@@ -1270,6 +1270,40 @@ def test_the_first_whose_certificate_holds_is_taken_and_else_the_best(
     assert tried == [1, 3]
 
 
+def test_what_holds_on_all_draws_is_verified_before_what_holds_on_few_and_of_each_kind_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A search keeps away from its limits, so what holds on all draws may cost more than 1.
+
+    Seen on the neck `spring`: two neighbours that four draws liked took all attempts at a certificate.
+    """
+    search = searching()
+    bounds = (Requirement("m", "max", 1.0, False),)
+    task: Any = SimpleNamespace(bounds=bounds, tested=False, asked=None)
+    search.task = task
+    few = [of_kind("b", 0.5, number=1), of_kind("b", 0.6, number=2), of_kind("c", 0.7, number=3)]
+    dear, fails = of_kind("a", 0.9, "margins"), of_kind("d", 1.1, "margins")
+    ranked = [dear, fails, *few]
+    monkeypatch.setattr(Search, "sort_candidates", lambda _: ranked)
+    monkeypatch.setattr(Search, "cost", lambda _, item: 2.0 if item.level == "margins" else 0.5)
+    monkeypatch.setattr(_certify, "most_attempts", lambda _: 5)
+    monkeypatch.setattr(_certify, "relaxations", lambda *_: {})
+    tried: list[Candidate] = []
+
+    def certify(_: Any, item: Candidate, *rest: Any) -> Any:
+        del rest
+        tried.append(item)
+        return SimpleNamespace(verification=SimpleNamespace(holds=False))
+
+    monkeypatch.setattr(_certify, "certify", certify)
+    _certify._verify_best(search, 0, None, lambda *_: None)
+    assert [id(item) for item in tried] == [id(dear), id(few[0])]
+    tried.clear()
+    ranked[:] = few
+    _certify._verify_best(search, 0, None, lambda *_: None)
+    assert [id(item) for item in tried] == [id(few[0]), id(few[2])]
+
+
 class _Resumed(Search):
     """A search that records what it resumes with, and finds one candidate."""
 
