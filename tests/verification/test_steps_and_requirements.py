@@ -16,6 +16,7 @@ import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError
 from softneck.core._certificate import required_rows
+from softneck.design import grid_response
 from softneck.estimation import LinearNeck
 from softneck.loop import LoopResult, metrics
 from softneck.robot import Robot
@@ -413,7 +414,7 @@ def test_a_controller_is_coupled_where_one_angle_moves_the_others_input() -> Non
     w = frequency_grid(TS, 15)
     z = np.exp(1j * w * TS)
     np.testing.assert_allclose(law.feedback(w)[:, 0, 0], -(z - 0.9) / (z - 0.5), rtol=1e-12)
-    assert np.abs(law._response(w, law.Br, law.Dr)).max() == 0.0
+    assert np.abs(grid_response(law.A, law.Br, law.C, law.Dr, z)).max() == 0.0
 
 
 def test_files_of_before_say_neck_for_what_is_sim_now() -> None:
