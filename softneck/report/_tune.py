@@ -159,7 +159,7 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
     known = ("steady_rms_", *(() if start else shape))
     table["limits"] = {f"{first}.{key}": limit for key, limit in limits.items() if key.startswith(known)}
     words = "" if found.observed else (
-        "\n# Without observer.npz: with it a requirement on the steps fails, or none was designed."
+        "\n# Without observer.npz: with it steps fail a requirement or rise later, or none was designed."
     )  # fmt: skip
     _write(folder / LOOP, f"# The best of `softneck tune` over {name}.{words}\n{tomli_w.dumps(table)}")
 
