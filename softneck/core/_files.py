@@ -217,7 +217,7 @@ def atomic_write(path: str | Path, *, force: bool = False) -> Iterator[Path]:
     try:
         target = _resolve_link(named)
         target.parent.mkdir(parents=True, exist_ok=True)
-        _sweep(target.parent)
+        remove_abandoned(target.parent)
         temporary, descriptor = _create_temporary(target)
     except OSError as error:
         raise OutputFileError(f"{named}: cannot be written: {error.strerror}. Choose another folder.") from error
@@ -249,14 +249,19 @@ def _create_temporary(target: Path) -> tuple[Path, int]:
     while True:
         path = target.with_name(f".{target.stem[:40]}{_NAME_MARK}{secrets.token_hex(4)}{target.suffix}")
         descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        # Between these two lines another process may have removed it as an abandoned file.
-        if path.exists():
-            return path, descriptor
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            # Between these two lines another process may have removed it as an abandoned file.
+            if path.exists():
+                return path, descriptor
+        except BaseException:  # Ctrl-C too leaves no file
+            path.unlink(missing_ok=True)
+            os.close(descriptor)
+            raise
         os.close(descriptor)
 
 
-def _sweep(folder: Path) -> None:
+def remove_abandoned(folder: Path) -> None:
     """Remove the temporary files of processes that ended: those whose lock is free."""
     for entry in os.scandir(folder):
         if entry.name.startswith(".") and _NAME_MARK in entry.name and entry.is_file(follow_symlinks=False):

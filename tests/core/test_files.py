@@ -249,3 +249,15 @@ def test_a_link_that_waits_under_the_temporary_s_name_is_not_followed(
     with pytest.raises(OutputFileError, match="a: cannot be written: File exists"), atomic_write(tmp_path / "a"):
         pytest.fail("the body must not run")
     assert (tmp_path / "theirs").read_text() == "somebody's"
+
+
+def test_ctrl_c_while_a_temporary_file_is_made_leaves_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen at the first file of a project: the next run refused its folder as not empty."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fcntl, "flock", interrupted)
+    with pytest.raises(KeyboardInterrupt), atomic_write(tmp_path / "a.json"):
+        pass
+    assert list(tmp_path.iterdir()) == []

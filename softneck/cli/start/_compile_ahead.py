@@ -15,14 +15,14 @@ from softneck.core import load
 from softneck.robot import Robot
 from softneck.runtime import cache_folder
 
-from ._plan import FAMILY, PI, linear_model, nonlinear_model
+from ._plan import AUTO, FAMILY, PI, linear_model
 
 
 def compile_ahead(*recordings: str) -> None:
     """Compile what the steps after the models call, in a process that no step waits for, with the lowest priority.
 
-    Run are an observer and the loops of one controller, over the model of the draws and over that of the loops, when
-    they are there; the steps then load the functions from the cache.
+    Run are an observer and the loops of one controller, over the model of the draws and over the best model if that is
+    nonlinear, when they are there; the steps then load the functions from the cache.
     """
     from softneck import estimation, signals, tuning
 
@@ -35,7 +35,9 @@ def compile_ahead(*recordings: str) -> None:
     for model in [] if family.draws is None else [family.draws.model, None]:
         if model is None:
             _await(PI)
-        task = tuning.task_of([bare, model or load(nonlinear_model() or linear_model())], None, 0)
+            if linear_model() == AUTO:
+                break
+        task = tuning.task_of([bare, model or load(AUTO)], None, 0)
         for level in reversed(tuning.LEVELS):  # margins first: the search needs their loops last
             tuning.judge_candidate(task, "pi", {}, level)
     compiled_before().touch()

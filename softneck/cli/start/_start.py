@@ -21,6 +21,7 @@ from softneck.core import (
     SoftneckError,
     find_kind,
     load,
+    remove_abandoned,
     require_file,
     settings_text,
 )
@@ -226,6 +227,8 @@ def _project(folder: Path) -> Iterator[None]:
     """Make `folder` the working folder; remove it at the end if no step made a file."""
     if folder.exists() and not folder.is_dir():
         raise SettingsError(f"{folder}: is a file; name a folder.")
+    if folder.is_dir():
+        remove_abandoned(folder)  # a run that was killed at its first file leaves a temporary one alone
     if folder.is_dir() and any(folder.iterdir()) and not (folder / FILE).is_file():
         raise OutputFileError(f"{folder}: is not empty and holds no `start.json`; choose another folder.")
     new = [path for path in (folder, *folder.parents) if not path.exists()]

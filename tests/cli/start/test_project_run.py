@@ -20,7 +20,7 @@ import pytest
 
 import softneck
 from softneck.cli.start import _compile_ahead, _plan, _project_run, _start
-from softneck.core import CheckFailedError, SettingsError
+from softneck.core import CheckFailedError, OutputFileError, SettingsError
 from softneck.robot import Robot
 
 from ...data import neck_recording
@@ -191,8 +191,9 @@ def test_functions_are_compiled_ahead_on_another_core_once_and_no_longer_than_th
     assert all(one.returncode for one in made), "it was ended"
 
 
-def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model(
-    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("nonlinear", [True, False])
+def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model_if_loops_are(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nonlinear: bool
 ) -> None:
     tuning, estimation = SimpleNamespace(LEVELS=("linear", "margins")), SimpleNamespace()
     ran: list[tuple[Any, ...]] = []
@@ -210,6 +211,7 @@ def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model(
 
     call("robot", "new", "robot.toml", "--preset", "neck")
     Path("models").mkdir()
+    Path("models", f"auto_{'linear' if nonlinear else 'nonlinear'}.npz").touch()  # the best of the other sort
     monkeypatch.setattr(softneck, "tuning", tuning)
     monkeypatch.setattr(softneck, "estimation", estimation)
     monkeypatch.setattr(_compile_ahead.os, "nice", int)
@@ -219,8 +221,8 @@ def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model(
     monkeypatch.setattr(_compile_ahead, "load", lambda name: _Family() if name == _plan.FAMILY else "best")
     _compile_ahead.compile_ahead("log.csv")
     # The search needs the loops of margins last, so these are compiled first: then the two cores do different ones.
-    assert ran == [("drawn",), ("drawn", "margins", False), ("drawn", "linear", False), ("best", "margins", True),
-                   ("best", "linear", True)]  # fmt: skip
+    best = [("best", "margins", True), ("best", "linear", True)] if nonlinear else []
+    assert ran == [("drawn",), ("drawn", "margins", False), ("drawn", "linear", False), *best]
     assert _compile_ahead.compiled_before().is_file()
 
 
@@ -596,3 +598,12 @@ def test_tendons_that_no_recording_pulls_far_enough_together_are_told(
     assert bool(said) == bool(told)
     assert told in said
     assert not said or "mixed --cocontraction" in " ".join(said.split())
+
+
+def test_a_run_that_was_killed_at_its_first_file_begins_again(tmp_path: Path) -> None:
+    (tmp_path / ".start-softneck-00000000.json").touch()
+    with _start._project(tmp_path):
+        assert list(Path().iterdir()) == []
+    (tmp_path / "theirs.txt").touch()
+    with pytest.raises(OutputFileError, match="is not empty"), _start._project(tmp_path):
+        pass
