@@ -53,7 +53,8 @@ def command(
     \b
     DIR gets  best.npz               the controller, and observer.npz for it
               best.certificate.json  of verify with the same requirements, if it holds
-              loop.toml              a loop with both, for softneck simulate; plant.npz if of draws
+              loop.toml              a loop with both, for softneck simulate; without a simulation
+                                     model it is over plant.npz, the model of the draws
               pareto.csv, .json      the Pareto front, and report.html
               tuner.html             all candidates, chosen by two sliders
               requirements.toml      all requirements, for tune and verify

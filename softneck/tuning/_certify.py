@@ -208,13 +208,15 @@ def _verify_loop(
 
 
 def _observed(task: Task, item: Candidate) -> bool:
-    """Return whether steps, and all that the draws of the search tell, keep their requirements with the observer."""
+    """Return whether steps, and the draws of the search, hold with the observer and rise as soon as without it."""
     eyes = task.observer
     if make_observer(task, item.kind) is not None:
         return True
     if eyes is None or not task.own or not holds_with_observer(task, item, eyes, task.bounds):
         return False
-    return not any(part.failed for part in _drawn_in_search(task, item, eyes.block()))
+    rise = item.metrics.get("sim.rise_s", math.inf)
+    drawn = _drawn_in_search(task, item, eyes.block())
+    return all(not part.failed and part.values["sim.rise_s"].max() <= rise for part in drawn)
 
 
 def holds_with_observer(task: Task, item: Candidate, observer: Any, bounds: tuple[Requirement, ...]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -276,8 +277,11 @@ def test_a_loop_is_delivered_with_the_observer_that_its_kind_needs_or_over_which
     monkeypatch.setattr(_certify, "make_observer", lambda *_: "eyes" if planned else None)
     monkeypatch.setattr(_certify, "holds_with_observer", lambda *_: held)
     task: Any = SimpleNamespace(observer=eyes, own={"p": 1} if own else {}, bounds=())
-    item: Any = SimpleNamespace(kind="pi")
-    # A loop over the second family fails, with this observer in it.
-    drawn = [SimpleNamespace(failed=()), SimpleNamespace(failed=failed)]
-    monkeypatch.setattr(_certify, "_drawn_in_search", lambda *told: drawn if told[2] == "seen" else [])
-    assert _certify._observed(task, item) is (planned or (eyes is not None and own and held and not failed))
+    item: Any = SimpleNamespace(kind="pi", metrics={"sim.rise_s": 0.5})
+    # A loop over the second family fails, or its slowest draw rises later, with this observer in it.
+    for rise, soon in ((0.5, True), (0.51, False), (math.nan, False)):
+        drawn = [SimpleNamespace(failed=(), values={"sim.rise_s": np.array([0.4])}),
+                 SimpleNamespace(failed=failed, values={"sim.rise_s": np.array([0.3, rise])})]  # fmt: skip
+        monkeypatch.setattr(_certify, "_drawn_in_search", lambda *told, drawn=drawn: drawn if told[2] == "seen" else [])
+        wanted = planned or (eyes is not None and own and held and not failed and soon)
+        assert _certify._observed(task, item) is wanted
