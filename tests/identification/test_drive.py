@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from softneck.identification import Network, Rls, SetMembership, fit_drive
+from softneck.identification.models._drive import LoadedDrive, drive_delays, fit_loaded_drive
 from softneck.signals import concatenate, signal
 
 from ..data import TRUTH, drive_positions, neck_recording, recording_from, slow_but
@@ -37,6 +38,19 @@ def test_a_run_shorter_than_the_longest_delay_does_no_harm(rows: int) -> None:
     both = concatenate([long, long.rows(20, 20 + rows)])
     assert fit_drive(both).delay.tolist() == list(TRUTH.drive_delay)
     Rls(delay=0.06).fit(both)
+
+
+@pytest.mark.parametrize("limited", [True, False])
+@pytest.mark.parametrize("stall", [0.0, 0.5])
+def test_the_dead_times_are_those_of_the_drive_with_its_load_limit(limited: bool, stall: float) -> None:
+    clean = neck_recording(600)
+    truth = LoadedDrive(fit_drive(clean).array, np.array([0.95, 1.5, 0.4, -0.2]))
+    # A drive that stalls part of the time seems later than it is, so that least squares and slack moves disagree.
+    m = truth.simulate(clean.set_points, clean.set_points[0])
+    mixed = (1.0 - stall) * clean.motor_positions + stall * m
+    recording = clean.with_channels(**dict(zip(clean.robot.motor_positions, mixed.T, strict=True)))
+    whole = fit_loaded_drive(recording, limited=limited)
+    np.testing.assert_array_equal(drive_delays(recording, limited=limited), whole.drive[:, 1])
 
 
 # Of the models, all but the grey box, whose drives are part of its own equations.

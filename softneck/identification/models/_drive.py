@@ -116,17 +116,26 @@ def load_in_si(load: Vector, scaling: Scaling) -> Vector:
 
 def fit_loaded_drive(recording: Recording, *, limited: bool = True) -> LoadedDrive:
     """Identify drives from logged positions, if `limited` with the load limit where it explains part of the error."""
-    # Of a robot every kind asks for it.
-    return compute_once(lambda: _fit_loaded_drive(recording, limited=limited), recording, limited)
-
-
-def _fit_loaded_drive(recording: Recording, *, limited: bool) -> LoadedDrive:
-    from scipy.optimize import minimize
-    from scipy.special import expit, logit
-
     plain = LoadedDrive(fit_drive(recording).array, NO_LOAD)
     if not recording.has_motor_positions or not limited:
         return plain
+    # Of a robot every kind asks for it.
+    runs = _first_runs(recording)
+    return compute_once(lambda: _fit_limit(runs, plain), runs, plain.drive)
+
+
+def drive_delays(recording: Recording, *, limited: bool = True) -> Vector:
+    """Return the dead times [samples] of `fit_loaded_drive` (motors,), which seldom needs the load limit for them."""
+    plain = fit_drive(recording)
+    if recording.has_motor_positions and limited:
+        slack = _fit_slack_drive(_first_runs(recording), plain.array)
+        if (slack[:, 1] != plain.delay).any():
+            return fit_loaded_drive(recording).drive[:, 1]
+    return plain.delay
+
+
+def _first_runs(recording: Recording) -> list[tuple[Matrix, Matrix]]:
+    """Return set-points and motor positions of the runs of the first rows."""
     left, runs = _MAX_ROWS, []
     for run in recording.runs():
         part = run.rows(0, min(len(run), left))
@@ -134,6 +143,14 @@ def _fit_loaded_drive(recording: Recording, *, limited: bool) -> LoadedDrive:
         left -= len(part)
         if left < 2:
             break
+    return runs
+
+
+def _fit_limit(runs: list[tuple[Matrix, Matrix]], plain: LoadedDrive) -> LoadedDrive:
+    """Return the drive with a load limit if that explains part of the error of `plain`."""
+    from scipy.optimize import minimize
+    from scipy.special import expit, logit
+
     error = _mean_squared_error(runs, plain)
     if error < _NEGLIGIBLE_ERROR:
         return plain

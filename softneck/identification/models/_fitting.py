@@ -33,7 +33,7 @@ from softneck.robot import Scaling
 from softneck.signals import scale_recording
 
 from ._directions import NECK_SECONDS, Directions, directions_of
-from ._drive import LoadedDrive, fit_loaded_drive
+from ._drive import LoadedDrive, drive_delays, fit_loaded_drive
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -250,8 +250,16 @@ class ScaledData:
     @property
     def drive(self) -> LoadedDrive:
         """The motors' lag, and the load limit of tendon robots that rest at zero."""
-        tendons = self.recording.robot.tendon_angles is not None and not self.scaling.motor_rest.any()
-        return fit_loaded_drive(self.data, limited=tendons)
+        return fit_loaded_drive(self.data, limited=self._has_load_limit)
+
+    @property
+    def drive_delays(self) -> Vector:
+        """The dead times of `drive` [samples], (motors,)."""
+        return drive_delays(self.data, limited=self._has_load_limit)
+
+    @property
+    def _has_load_limit(self) -> bool:
+        return self.recording.robot.tendon_angles is not None and not self.scaling.motor_rest.any()
 
     @property
     def gains(self) -> Vector:

@@ -117,7 +117,7 @@ def _model(settings: GreyBox, problem: FitProblem, scaled: ScaledData, delay: in
         error[:skip] = np.nan
     echo = np.array([fit_noise_model([error[:, axis] for error in errors], _NOISE_ORDER) for axis in range(outputs)])
     pole = np.exp(-numbers[0] * problem.sample_time)
-    drive = np.column_stack([np.full(len(problem.drive), pole), problem.drive[:, 1]])
+    drive = np.column_stack([np.full(len(problem.drive_delays), pole), problem.drive_delays])
     arrays = {
         "history": history_array(int(max(_NOISE_ORDER, drive[:, 1].max())), outputs),
         "drive": drive,

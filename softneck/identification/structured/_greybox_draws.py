@@ -123,8 +123,8 @@ class GreyBoxDraws:
 
     def _as_arrays(self, x: Vector, delay: int) -> dict[str, Matrix]:
         problem, numbers, load = self.problem, self.problem.decode(x), self.problem.load(x)
-        drive = problem.drive.copy()
-        drive[:, 0] = np.exp(-numbers[0] * problem.sample_time)
+        pole = np.exp(-numbers[0] * problem.sample_time)
+        drive = np.column_stack([np.full(len(problem.drive_delays), pole), problem.drive_delays])
         found = {"neck": numbers, "drive": drive, "sensor": np.array([float(delay), problem.sample_time])}
         body = {"body": problem.body(x)} if "body" in self.model.arrays else {}
         return found | body | ({"payload": load} if load.size else {})

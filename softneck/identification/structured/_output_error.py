@@ -51,7 +51,7 @@ class FitProblem:
     """All runs as arrays; the drives' dead times are known beforehand.
 
     runs: set-points, start, motor positions and outputs of each; rows: those of each run that count; payloads: [kg];
-    drive: (motors, 2) pole and delay; logged: whether motor positions were; numbers: searched; tendons: nothing of
+    drive_delays: (motors,) in samples; logged: whether motor positions were; numbers: searched; tendons: nothing of
     three tendons 120 deg apart; reach: largest tilt [rad]; prior: what a number a spread away from its guess counts, as
     an error [rad] of one row.
     """
@@ -61,7 +61,7 @@ class FitProblem:
     rows: list[np.ndarray]
     payloads: list[float]
     payload_range: tuple[float, float]
-    drive: Matrix
+    drive_delays: Vector
     logged: bool
     numbers: tuple[Parameter, ...]
     tendons: Vector
@@ -69,11 +69,11 @@ class FitProblem:
     prior: float = _PRIOR_WEIGHT_RAD
 
     @classmethod
-    def of(cls, scaled: ScaledData) -> FitProblem:
-        recording, drive, Ts = scaled.data, scaled.drive.drive.copy(), scaled.data.sample_time
+    def of(cls, scaled: ScaledData, drive_delays: Vector | None = None) -> FitProblem:
+        recording, Ts = scaled.data, scaled.data.sample_time
+        delays = np.maximum(scaled.drive_delays if drive_delays is None else drive_delays, 1.0)
         if not recording.has_motor_positions:
-            drive[:, 1] = max(round(_TYPICAL_DRIVE_DELAY / Ts), 1)
-        drive[:, 1] = np.maximum(drive[:, 1], 1.0)
+            delays[:] = max(round(_TYPICAL_DRIVE_DELAY / Ts), 1)
         runs = [
             (np.ascontiguousarray(run.set_points), drive_start(run), run.motor_positions, run.outputs)
             for run in recording.runs()
@@ -90,7 +90,7 @@ class FitProblem:
             rows=rows,
             payloads=payloads,
             payload_range=(min(payloads), max(payloads)),
-            drive=drive,
+            drive_delays=delays,
             logged=recording.has_motor_positions,
             numbers=numbers,
             tendons=_tendons(recording.robot),
@@ -162,7 +162,7 @@ class FitProblem:
                 loaded_neck(numbers, load, payload) if load.size else numbers,
                 body,
                 self.sample_time,
-                np.ascontiguousarray(self.drive[:, 1]),
+                self.drive_delays,
                 0,
                 settle,
                 u,

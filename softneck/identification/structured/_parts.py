@@ -154,7 +154,8 @@ def _needed(trials: list[_Trial], parts: Sequence[str]) -> tuple[float, list[_Tr
 
 def _trial(found: Found, scaled: ScaledData, fold: Fold, evaluations: int, tell: SearchProgress) -> _Trial:
     def problem_of(recording: Recording) -> FitProblem:
-        whole, own = found.problem, FitProblem.of(replace(scaled, data=recording))
+        whole = found.problem
+        own = FitProblem.of(replace(scaled, data=recording), whole.drive_delays)
         return replace(own, numbers=whole.numbers, payload_range=whole.payload_range, reach=whole.reach)
 
     problem = problem_of(fold.train)
