@@ -1,9 +1,11 @@
-"""One BLAS thread while a fit, a search or a verification runs."""
+"""One BLAS thread while a fit, a search or a verification runs, and functions side by side on the free cores."""
 
 from __future__ import annotations
 
+import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -67,3 +69,52 @@ def one_blas_thread(function: Callable[_Arguments, _Result]) -> Callable[_Argume
             return function(*args, **kwargs)
 
     return with_one_thread
+
+
+def core_count() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+# Cores beside that of the caller: calls within calls share them, so that threads never outnumber cores.
+_FREE_CORES = threading.Semaphore(core_count() - 1)
+
+
+def side_by_side(calls: Sequence[Callable[[], _Result]]) -> list[_Result]:
+    """Return the results of `calls`, which begin in their order, in this thread and in one more for each free core.
+
+    It pays where they are compiled or in BLAS most of the time, which let go of Python's lock. The first error ends it.
+    """
+    found: dict[int, _Result] = {}
+    left = iter(enumerate(calls))
+
+    def work() -> None:
+        for number, call in left:
+            try:
+                found[number] = call()
+            except BaseException:
+                list(left)  # nobody begins another
+                raise
+
+    def help_out() -> None:
+        try:
+            work()
+        finally:
+            _FREE_CORES.release()
+
+    more = 0
+    while more < len(calls) - 1 and _FREE_CORES.acquire(blocking=False):
+        more += 1
+    if not more:
+        return [call() for call in calls]
+    with ThreadPoolExecutor(more) as pool:
+        helpers = [pool.submit(help_out) for _ in range(more)]
+        work()
+        _FREE_CORES.release()  # while this thread waits, a helper's calls may use its core
+        try:
+            wait(helpers)
+        finally:
+            _FREE_CORES.acquire()
+    for helper in helpers:
+        helper.result()
+    return [found[number] for number in range(len(calls))]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
@@ -22,17 +23,22 @@ def compute_once(compute: Callable[[], _T], *things: Any) -> _T:
     digest = content_digest(compute.__qualname__, *things)
     if digest is None:
         return compute()
-    kept = _results(digest)
-    if not kept:
-        kept.append(compute())
+    with _LOOKING:  # `lru_cache` may else make two lists
+        lock, kept = _results(digest)
+    with lock:  # another thread may be computing it
+        if not kept:
+            kept.append(compute())
     return kept[0]
 
 
 # A search and the certificates of its best need five results, a comparison of kinds ten drives.
 @lru_cache(maxsize=16)
-def _results(digest: str) -> list[Any]:
+def _results(digest: str) -> tuple[threading.RLock, list[Any]]:
     del digest
-    return []
+    return threading.RLock(), []
+
+
+_LOOKING = threading.Lock()
 
 
 def content_digest(*things: Any) -> str | None:

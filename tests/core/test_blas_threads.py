@@ -1,18 +1,22 @@
-"""One BLAS thread inside every fit, `tune` and `verify`, and as many as before outside."""
+"""One BLAS thread inside every fit, `tune` and `verify`, and as many as before outside; calls side by side."""
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import cast
 
 import pytest
 import scipy.linalg  # noqa: F401  (its BLAS is one of those that are counted)
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from softneck.core._blas_threads import one_blas_thread
+from softneck.core import _blas_threads
+from softneck.core._blas_threads import one_blas_thread, side_by_side
 from softneck.core._kinds import KINDS, kinds_of, make_settings, resolve
 from softneck.identification import FamilySettings
 from softneck.identification.selection._auto import choose
@@ -110,3 +114,59 @@ def test_the_command_line_limits_numpy_before_it_is_imported() -> None:
     environment = {"PATH": "/usr/bin:/bin"}  # without a number of threads
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert done.stdout.split() == ["False", "1"]
+
+
+@pytest.fixture
+def free(monkeypatch: pytest.MonkeyPatch) -> threading.Semaphore:
+    """Two cores beside that of the caller."""
+    cores = threading.Semaphore(2)
+    monkeypatch.setattr(_blas_threads, "_FREE_CORES", cores)
+    return cores
+
+
+def _count(free: threading.Semaphore) -> int:
+    return next(taken for taken in itertools.count() if not free.acquire(blocking=False))
+
+
+def test_calls_side_by_side_meet_and_return_in_their_order(free: threading.Semaphore) -> None:
+    meeting = threading.Barrier(3, timeout=10.0)
+
+    def meet(number: int) -> int:
+        meeting.wait()  # each waits for two others, which one thread alone would never see
+        return number
+
+    assert side_by_side([partial(meet, number) for number in range(6)]) == list(range(6))
+    assert _count(free) == 2
+
+
+def test_calls_within_calls_take_no_more_threads_than_cores(free: threading.Semaphore) -> None:
+    running, most, lock = 0, 0, threading.Lock()
+
+    def work() -> None:
+        nonlocal running, most
+        with lock:
+            running += 1
+            most = max(most, running)
+        time.sleep(0.001)
+        with lock:
+            running -= 1
+
+    side_by_side([lambda: side_by_side([work] * 5)] * 4)
+    assert most <= 3
+    assert _count(free) == 2
+
+
+@pytest.mark.parametrize("wrong", range(4))
+def test_an_error_side_by_side_ends_what_has_not_begun(free: threading.Semaphore, wrong: int) -> None:
+    begun: list[int] = []
+
+    def run(number: int) -> None:
+        begun.append(number)
+        if number == wrong:
+            raise _AskedError(number)
+        time.sleep(0.001)
+
+    with pytest.raises(_AskedError, match=str(wrong)):
+        side_by_side([partial(run, number) for number in range(100)])
+    assert len(begun) < 100
+    assert _count(free) == 2

@@ -27,6 +27,7 @@ from softneck.core import (
     SettingsError,
     SoftneckError,
     atomic_write,
+    core_count,
     file_hash,
     settings_text,
 )
@@ -89,7 +90,7 @@ class ProjectRun:
         if not kept:
             for other in step.beside:
                 self._begin(other)
-            if step.compiles and _core_count() > 1 and not _compile_ahead.compiled_before().is_file():
+            if step.compiles and core_count() > 1 and not _compile_ahead.compiled_before().is_file():
                 code = f"from {_compile_ahead.__name__} import compile_ahead; compile_ahead{step.compiles!r}"
                 self.begun["compile ahead"] = _Process.of(["-c", code])
             begun = bool(same and entry and not entry.get("ended"))
@@ -123,7 +124,7 @@ class ProjectRun:
 
     def _begin(self, step: Step) -> None:
         """Begin a step in a process of its own, if it is to be done and there is a core for it."""
-        if step.key not in self.begun and not self._is_done(step) and _core_count() > 1:
+        if step.key not in self.begun and not self._is_done(step) and core_count() > 1:
             words = ["-m", *step.command, *(["--json"] if self.as_json else [])]
             self.begun[step.key] = _Process.of(words, step.makes, _hashes(step))
 
@@ -207,10 +208,6 @@ class _Process:
         """Close the files with what it said."""
         for stream in self.said:
             stream.close()
-
-
-def _core_count() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _processor_time() -> float:

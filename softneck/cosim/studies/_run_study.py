@@ -6,7 +6,6 @@ Workers are this process, local processes of loky, or a Dask cluster; all are ex
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import tempfile
 import threading
@@ -24,6 +23,7 @@ from softneck.core import (
     Progress,
     SettingsError,
     SoftneckError,
+    core_count,
     require_package,
     shown_progress,
     silent,
@@ -83,7 +83,7 @@ def open_workers(workers: int | None, dask: str | None) -> Iterator[WorkerPool]:
             finally:
                 pool.shutdown(wait=False)
         return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = core_count()
     number = cores if workers is None else workers
     if isinstance(number, bool) or not isinstance(number, int) or number < 0:
         raise SettingsError(f"`workers` must be a whole number of at least 1 (0: this process); got {number!r}.")

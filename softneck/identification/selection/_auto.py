@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from softneck.core import (
     SoftneckError,
     one_blas_thread,
     resolve,
+    side_by_side,
     silent,
 )
 from softneck.signals import Recording, poor_excitation
@@ -272,14 +275,11 @@ def choose(
                 f"`{name}` has {samples} sample(s) in the rows held out, too few to judge by. Record longer."
             )
     race = _Race(train, hold_out, folds(train, hold_out, other_excitation=other_excitation), seed)
-    for number, kind in enumerate(wanted):
-        progress(0.7 * number / len(wanted), _progress_text(kind, list(race.tried.values())))
-        race.screen(kind)
+    race.screen_all(wanted, lambda done, what: progress(0.7 * done, what))
     race.examine()
     race.leave_out(lambda done, what: progress(0.7 + 0.1 * done, what))
     best = race.train_best(lambda done, what: progress(0.8 + 0.1 * done, what))
-    chosen = race.guard_best(best, lambda done, what: progress(0.9 + 0.1 * done, what))
-    race.train_other(chosen)
+    chosen = race.finish(best, lambda done, what: progress(0.9 + 0.1 * done, what))
     ranking = race.ranking()
     progress(1.0, f"chosen: {chosen.kind}")
     alike = [one for one in ranking if one.fit > best.fit - ALIKE and one not in (best, chosen)]
@@ -322,6 +322,17 @@ class _Race:
         """Return all kinds, the best first."""
         return tuple(sorted(self.tried.values(), key=lambda one: -one.fit))
 
+    def screen_all(self, kinds: Sequence[str], progress: Progress) -> None:
+        """Screen the kinds side by side, the longest training first but for `nn`, which has a thread for each axis."""
+        begun = itertools.count()
+
+        def screen(kind: str) -> None:
+            progress(next(begun) / len(kinds), _progress_text(kind, list(self.tried.values())))
+            self.screen(kind)
+
+        side_by_side([partial(screen, kind) for kind in sorted(kinds, key=lambda kind: kind != "greybox")])
+        self.tried = {kind: self.tried[kind] for kind in kinds}
+
     def screen(self, kind: str) -> None:
         """Identify a kind in its short form, and score it on the parts left out and on the hold-out."""
         fold, begin = self.folds[0], time.perf_counter()
@@ -356,9 +367,9 @@ class _Race:
         for number, fold in enumerate(self.folds[1:], start=1):
             running = sorted(running, key=lambda one: -self.tried[one.kind].fit)
             running = running[: max(-(-len(running) // 2), 2)]
-            for one in running:
-                progress(number / len(self.folds), f"{one.kind} without {fold.judged[0].name}")
-                self._leave_out(one.kind, fold)
+            names = [one.kind for one in running]
+            progress(number / len(self.folds), f"{', '.join(names)} without {fold.judged[0].name}")
+            side_by_side([partial(self._leave_out, kind, fold) for kind in names])
 
     def _leave_out(self, kind: str, fold: Fold) -> None:
         begin = time.perf_counter()
@@ -384,6 +395,14 @@ class _Race:
             progress(0.0, f"{best.kind} on all rows to train on")
             self.whole(best.kind)
             trained += 1
+
+    def finish(self, best: KindTrial, progress: Progress) -> KindTrial:
+        """Return the result of `guard_best`, and train that of `best_others` on all rows beside it."""
+        others = [one for one in best_others(self.ranking(), best).values() if not one.whole]
+        calls: list[Callable[[], KindTrial]] = [lambda: self.guard_best(best, progress)]
+        chosen, *trained = side_by_side(calls + [partial(self._trained, one.kind) for one in others])
+        self.tried |= {one.kind: one for one in trained}
+        return chosen
 
     def guard_best(self, best: KindTrial, progress: Progress) -> KindTrial:
         """Return the guarded form of a learned kind unless it is worse on the rows held out.
@@ -416,14 +435,11 @@ class _Race:
         self.tried["guarded"] = one
         return one if one.hold_out_fit > best.hold_out_fit - _GUARD_COST else best
 
-    def train_other(self, chosen: KindTrial) -> None:
-        """Train the result of `best_others` on all rows."""
-        for other in best_others(self.ranking(), chosen).values():
-            if not other.whole:
-                self.whole(other.kind)
-
     def whole(self, kind: str) -> None:
         """Train a kind on all rows to train on, and judge it again on the hold-out."""
+        self.tried[kind] = self._trained(kind)
+
+    def _trained(self, kind: str) -> KindTrial:
         one = self.tried[kind]
         begin = time.perf_counter()
         try:
@@ -438,10 +454,9 @@ class _Race:
             if self.folds[0].judged:
                 outputs[SECOND] = second_training(model, self.short[kind], self.folds[0])
         except Exception as error:  # one kind never ends the search
-            self.tried[kind] = KindTrial(kind, one.seconds, failure=_reason(error))
-            return
+            return KindTrial(kind, one.seconds, failure=_reason(error))
         one = replace(one, seconds=one.seconds + time.perf_counter() - begin, errors={**one.errors, HOLD_OUT: error})
-        self.tried[kind] = replace(one, model=model, judged=judged, whole=True, outputs=outputs)
+        return replace(one, model=model, judged=judged, whole=True, outputs=outputs)
 
     def _each_held_out(self, model: Model) -> dict[str, Fits]:
         return {part.name: part.fits(model)[0] for part in motions_held_out(self.hold_out, self.train)}

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from softneck.core import Matrix, Vector
+from softneck.core import Matrix, Vector, side_by_side
 
 # Of finite differences, in scales: far above rounding, far below the curvature.
 _DIFFERENCE = 1e-4
@@ -45,7 +46,10 @@ class _Point:
 
 
 def minimise(errors: Callable[[Vector], Vector], start: Vector, bounds: Bounds, steps: int) -> Vector:
-    """Return the variables (n,) of the least squared error that are found in at most `steps` steps."""
+    """Return the variables (n,) of the least squared error that are found in at most `steps` steps.
+
+    `errors` is called from several threads.
+    """
     at = _Point(x := np.clip(start, bounds.low, bounds.high), errors(x))
     curved, damping, stalled = False, _FIRST, 0
     for _ in range(steps):
@@ -70,11 +74,15 @@ def minimise(errors: Callable[[Vector], Vector], start: Vector, bounds: Bounds, 
 def _jacobian(errors: Callable[[Vector], Vector], at: _Point, bounds: Bounds) -> Matrix:
     """Return the slopes (errors, n) by differences that stay within the bounds."""
     J = np.empty((at.e.size, at.x.size))
-    for i, step in enumerate(_DIFFERENCE * bounds.scale):
-        signed = step if at.x[i] + step <= bounds.high[i] else -step
+    steps = _DIFFERENCE * bounds.scale
+    steps = np.where(at.x + steps <= bounds.high, steps, -steps)
+
+    def column(i: int) -> None:
         moved = at.x.copy()
-        moved[i] += signed
-        J[:, i] = (errors(moved) - at.e) / signed
+        moved[i] += steps[i]
+        J[:, i] = (errors(moved) - at.e) / steps[i]
+
+    side_by_side([partial(column, i) for i in range(at.x.size)])
     return J
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -19,12 +18,14 @@ from softneck.core import (
     SettingsError,
     SoftneckError,
     Vector,
+    core_count,
     find_kind,
     one_blas_thread,
     require_one_of,
     require_positive,
     require_whole,
     resolve,
+    side_by_side,
     silent,
 )
 from softneck.signals import Recording, concatenate
@@ -109,7 +110,8 @@ def _block(runs: Sequence[Recording], i: int, parts: int) -> tuple[Recording, Re
 
 def left_out_error(fit: Callable[[Recording], Model], parts: Sequence[tuple[Recording, Recording]]) -> Vector:
     """Return the rms error (outputs,) of simulations over parts that were left out in turn; inf where one diverges."""
-    errors = np.concatenate([_simulation_errors(fit(rest), part) for rest, part in parts])
+    calls = [lambda rest=rest, part=part: _simulation_errors(fit(rest), part) for rest, part in parts]
+    errors = np.concatenate(side_by_side(calls))
     return np.sqrt(np.nanmean(errors**2, axis=0))
 
 
@@ -231,9 +233,8 @@ class Guarded:
         wanted = len(jobs)
         for number, (rest, part) in enumerate(left_out(recording, self.members)):
             jobs.append(Job(f"member {number + 1}", _member, (self.of, self.seed + number, rest, part)))
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         # The others are trained sooner than processes start.
-        workers = min(self.workers or cores, len(jobs)) if self.of == "nn" else 1
+        workers = min(self.workers or core_count(), len(jobs)) if self.of == "nn" else 1
         found = run_jobs(jobs, workers, progress)
         model = self.around(_least_missing(found[:wanted]), found[wanted:], recording)
         progress(1.0, "done")

@@ -103,7 +103,7 @@ def test_a_step_that_begins_with_another_makes_and_says_the_same_in_its_turn(
     call: Call, short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int
 ) -> None:
     begun: list[Any] = []
-    monkeypatch.setattr(_project_run, "_core_count", lambda: cores)
+    monkeypatch.setattr(_project_run, "core_count", lambda: cores)
     monkeypatch.setattr(_project_run.subprocess, "Popen", lambda *a, **k: begun.append(popen(*a, **k)) or begun[-1])
     monkeypatch.setattr(_start, "steps", beside(_start.steps, "robot", "new", "copy.toml", "--preset", "arm"))
     said = call("start", "log.csv", "-o", "p", "--yes")
@@ -140,7 +140,7 @@ def test_steps_that_begin_early_read_nothing_that_the_steps_before_their_turn_ma
 def test_a_step_that_failed_beside_another_tells_of_it_in_its_turn(
     call: Call, short: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_project_run, "_core_count", lambda: 2)
+    monkeypatch.setattr(_project_run, "core_count", lambda: 2)
     monkeypatch.setattr(_start, "steps", beside(_start.steps, "robot", "new", "copy.toml", "--preset", "nobody"))
     said = call("start", "log.csv", "-o", "p", "--yes")
     assert said.code == 2
@@ -150,7 +150,7 @@ def test_a_step_that_failed_beside_another_tells_of_it_in_its_turn(
 
 def test_a_step_that_has_no_turn_leaves_no_file(call: Call, short: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[Any] = []
-    monkeypatch.setattr(_project_run, "_core_count", lambda: 2)
+    monkeypatch.setattr(_project_run, "core_count", lambda: 2)
     monkeypatch.setattr(_project_run.subprocess, "Popen", lambda *a, **k: begun.append(popen(*a, **k)) or begun[-1])
 
     def fails(words: tuple[str, ...], *, as_json: bool) -> None:
@@ -181,7 +181,7 @@ def test_functions_are_compiled_ahead_on_another_core_once_and_no_longer_than_th
         return made[-1]
 
     monkeypatch.setattr(_compile_ahead, "cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(_project_run, "_core_count", lambda: cores)
+    monkeypatch.setattr(_project_run, "core_count", lambda: cores)
     monkeypatch.setattr(_project_run.subprocess, "Popen", waits)
     monkeypatch.setattr(_start, "steps", changed)
     if before:
