@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 from softneck import identification, plots, signals
-from softneck.core import CheckFailedError, refuse_existing, to_si
+from softneck.core import CheckFailedError, refuse_existing
 
 from .shared._console import print_json, progress
 from .shared._options import apply_settings, common_options, kind_command, output_option, set_option, target
@@ -138,9 +138,7 @@ def _parameters(numbers: np.ndarray) -> dict[str, float]:
 
 
 def _page(family: identification.Family) -> str:
-
-    outputs, motors = family.robot.outputs, family.robot.motors
-    unit, gain = f"{outputs.display_unit}/{motors.unit}", to_si(motors.unit)[0] / to_si(outputs.display_unit)[0]
+    gain, unit = family.robot.shown_gain
     sections = []
     for name, axis in family.axes.items():
         chart = plots.cover_chart(family.frequency, *_cover(family, name), f"{name}: the weight over its samples")
@@ -156,12 +154,13 @@ def _page(family: identification.Family) -> str:
 def _verdict(family: identification.Family, name: str, gain: float, unit: str) -> str:
     """Return the band in which the weight covers the measured responses, and the range of the plant."""
     low, high = (_numbers(row, gain) for row in family.axes[name].box)
+    shown = f"{name[0].upper()}{name[1:]}"
     span = f"its static gain is {low[0]} to {high[0]} {unit} and its dead time {low[2]} to {high[2]} ms"
     band = family.band(name)
     if band is None:
-        return f"{name.capitalize()} was not tested against the data; {span}."
+        return f"{shown} was not tested against the data; {span}."
     return (
-        f"{name.capitalize()}: the weight covers every response measured from {band[0]:.2g} to {band[1]:.2g} rad/s; "
+        f"{shown}: the weight covers every response measured from {band[0]:.2g} to {band[1]:.2g} rad/s; "
         f"nothing is known above. In them {span}."
     )
 

@@ -178,19 +178,21 @@ def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> di
 def _log(file: Path, html: Path | None, error: DataError | FileFormatError | None) -> dict[str, Any]:
     """Return the guessed content of a log; `error` is the reason that it is no recording."""
     try:
-        guess = signals.guess_layout(file)
+        other = signals.is_of_another_robot(file)
+        guess = signals.guess_robot(file) if other else signals.guess_layout(file)
     except (DataError, FileFormatError) as reason:
         raise error or FileFormatError(
             f"{file}: by its ending not a file of softneck, nor is it a log ({str(reason).removeprefix(f'{file}: ')})"
         ) from reason
-    if error is not None and _is_titled(guess):
+    missing = guess.missing if isinstance(guess, signals.Guess) else ()
+    if error is not None and isinstance(guess, signals.Guess) and _is_titled(guess):
         raise error
     if html is not None:
         raise SettingsError(f"{file}: `--html` shows the quality of a recording, and this is a log; import it first.")
     return {
         "type": "log",
         "columns": list(guess.lines),
-        "missing": list(guess.missing) or "nothing that a recording needs",
+        "missing": list(missing) or "nothing that a recording needs",
         "import": f"softneck import {file} --guess -o {file.stem}.recording.csv",
     }
 

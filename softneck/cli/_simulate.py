@@ -154,7 +154,11 @@ def _print(path: Path, result: cosim.Result) -> None:
 def _metrics(result: cosim.Result) -> tuple[list[str], list[list[str]]]:
     rows = []
     for part, values in result.metrics.items():
-        rows += [[f"{part}.{name}", "-" if value is None else f"{value:.3f}"] for name, value in values.items()]
+        rows += [
+            [f"{part}.{name}", "-" if value is None else f"{value:.3f}"]
+            for name, value in values.items()
+            if name != "slack_s" or result.robot.tendon_angles is not None
+        ]
     return ["metric", "value"], rows
 
 

@@ -31,17 +31,18 @@ _UNITS: dict[str, tuple[float, str, str]] = {
     "mbar": (1e2, "Pa", ""), "psi": (6894.757293168361, "Pa", "psig"), "atm": (101_325.0, "Pa", ""),
     "mmHg": (133.322387415, "Pa", "torr"), "V": (1.0, "V", "volt volts"), "mV": (1e-3, "V", ""),
     "A": (1.0, "A", "amp amps ampere"), "mA": (1e-3, "A", ""), "W": (1.0, "W", "watt watts"), "Hz": (1.0, "Hz", ""),
-    "m/s2": (1.0, "m/s2", "m/s^2 m/s²"), "T": (1.0, "T", "tesla"), "mT": (1e-3, "T", ""), "gauss": (1e-4, "T", ""),
+    "m/s2": (1.0, "m/s2", "m/s^2 m/s²"), "K": (1.0, "K", "kelvin"),
+    "degC": (1.0, "degC", "°c celsius"), "T": (1.0, "T", "tesla"), "mT": (1e-3, "T", ""), "gauss": (1e-4, "T", ""),
     "%": (1e-2, "1", "pct percent prozent"), "1": (1.0, "1", ""),
 }  # fmt: skip
 _SPELLED = {word: unit for unit, (_, _, others) in _UNITS.items() for word in (*others.split(), unit.lower())}
 
-#: SI unit -> its exponents of base units, by name; FMI and SSP count rad among them.
+#: SI unit -> its exponents of base units, by name; FMI and SSP count rad among them. degC has none.
 SI_BASES: dict[str, dict[str, int]] = {
     "rad": {"rad": 1}, "rad/s": {"rad": 1, "s": -1}, "s": {"s": 1}, "m": {"m": 1}, "m/s": {"m": 1, "s": -1},
     "m/s2": {"m": 1, "s": -2}, "kg": {"kg": 1}, "N": {"kg": 1, "m": 1, "s": -2}, "Nm": {"kg": 1, "m": 2, "s": -2},
     "Pa": {"kg": 1, "m": -1, "s": -2}, "A": {"A": 1}, "V": {"A": -1, "kg": 1, "m": 2, "s": -3},
-    "W": {"kg": 1, "m": 2, "s": -3}, "T": {"A": -1, "kg": 1, "s": -2}, "Hz": {"s": -1}, "1": {},
+    "W": {"kg": 1, "m": 2, "s": -3}, "T": {"A": -1, "kg": 1, "s": -2}, "Hz": {"s": -1}, "K": {"K": 1}, "degC": {}, "1": {},
 }  # fmt: skip
 
 #: What a unit's spelling leaves open.

@@ -135,7 +135,8 @@ class KalmanObserver(ReprMixin):
             outputs=outputs,
             parameters=tuple(
                 Port(name=name, unit=unit, start=value, minimum=min(1e-9, _MIN_LEVEL_FACTOR * value),
-                     maximum={"rad": math.pi, "rad/s": 1e3}.get(unit), description="standard deviation")
+                     maximum={"rad": math.pi, "rad/s": 1e3}.get(unit), description="standard deviation",
+                     display_unit=self.robot.outputs.shown if unit == to_si(self.robot.outputs.unit)[1] else "")
                 for (name, unit), value in levels
             ),
         )  # fmt: skip

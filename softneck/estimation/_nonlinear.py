@@ -136,7 +136,14 @@ class NonlinearObserver(ReprMixin):
             inputs=inputs,
             outputs=(*outputs, *payload),
             parameters=tuple(
-                Port(name=name, unit=unit, start=value, minimum=0.0, description=meaning)
+                Port(
+                    name=name,
+                    unit=unit,
+                    start=value,
+                    minimum=0.0,
+                    description=meaning,
+                    display_unit=self.robot.outputs.shown if unit == to_si(self.robot.outputs.unit)[1] else "",
+                )
                 for (name, unit), value, meaning in zip(
                     noise_units(FORM, self.robot), self.noise, _NOISE_DESCRIPTIONS, strict=True
                 )

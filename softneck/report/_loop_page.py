@@ -105,6 +105,7 @@ def _metrics(result: Result) -> list[list[str]]:
     return [
         [_title(f"{part}.{name}"), cell(value, ".3f")]
         for part, values in result.metrics.items() for name, value in values.items()
+        if name != "slack_s" or result.robot.tendon_angles is not None
     ]  # fmt: skip
 
 

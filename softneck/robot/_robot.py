@@ -243,6 +243,12 @@ class Robot(ReprMixin):
         return np.radians(angles) if self.directions.kind == "tendons" else None
 
     @property
+    def shown_gain(self) -> tuple[float, str]:
+        """Factor from a gain in SI to the one that people see, and its unit, such as `deg/rad`."""
+        shown, motor = self.outputs.display_unit, self.motors.unit
+        return to_si(motor)[0] / to_si(shown)[0], shown if motor == "1" else f"{shown}/{motor}"
+
+    @property
     def angle_limit(self) -> float:
         """Largest angle of an output [rad]: half a turn where tendons bend the robot; what rotates has no limit."""
         return np.pi if self.tendon_angles is not None and to_si(self.outputs.unit)[1] == "rad" else np.inf

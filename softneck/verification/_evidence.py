@@ -211,7 +211,7 @@ def _add_data_margins(evidence: Evidence) -> None:
     for name, (values, behind) in crossing_values(evidence.crossings).items():
         _add(evidence, name, Values(values, lambda row, behind=behind: crossing_facts(behind[row])))
     if not evidence.crossings:
-        why = "no simulation model was given (a nonlinear MODEL, a NECK, an FMU)"
+        why = "no simulation model was given (a nonlinear MODEL, an FMU, the robot's NECK)"
         evidence.not_computed["margins by experiment"] = why
 
 

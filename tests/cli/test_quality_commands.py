@@ -41,6 +41,19 @@ def test_a_page_of_anything_but_a_recording_is_refused(call: Call, rls_file: Pat
     assert not (tmp_path / "q.html").exists()
 
 
+def test_info_says_which_columns_of_another_robots_log_are_what(call: Call, tmp_path: Path) -> None:
+    """As `import --guess` would: a titled clock made such a log a recording of the neck with a wrong channel."""
+    u = np.repeat(np.random.default_rng(0).uniform(0.0, 5.0, 20), 20)
+    rows = "\n".join(f"{0.02 * k:.2f};{u[k]:.4f};{u[k - 3]:.4f}".replace(".", ",") for k in range(3, 400))
+    (tmp_path / "log.csv").write_bytes(f"time [s];Düse [V];Krümmung [°]\n{rows}\n".encode("cp1252"))
+    said = call("info", "log.csv")
+    assert (said.code, said.err) == (0, "")
+    assert "type: log" in said.out
+    assert "motors: Düse [V]" in said.out
+    assert "outputs: Krümmung [°]" in said.out
+    assert "missing: nothing that a recording needs" in said.out
+
+
 def test_record_keeps_to_limits_and_says_what_it_changed(call: Call) -> None:
     said = call("record", "eq22", "-o", "r.csv", "--duration", 6, "--max-position", 2, "--json")
     changes = json.loads(said.out)["changes"]

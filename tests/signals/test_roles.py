@@ -95,6 +95,9 @@ ROBOTS: dict[str, tuple[dict[str, Vector], list[str], list[str], list[str], str,
         {"time": TIME, **{f"motor_cmd_{j} [rad]": one for j, one in enumerate((A, B, C, A[::-1]), start=1)},
          "pitch [deg]": BENT, "roll [deg]": TURNED, "pitch_ref [deg]": C},
         [f"motor_cmd_{j} [rad]" for j in range(1, 5)], [], ["pitch [deg]", "roll [deg]"], "rad", "deg"),
+    "a plate that is only heated": (
+        {"time_s": TIME, "heater_current_A": A, "plate_temp_degC": 20.0 + ONE, "ambient_degC": WARM},
+        ["heater_current_A"], [], ["plate_temp_degC"], "A", "degC"),
     "pressures by words alone, a tip": (
         {"time": TIME, "pressure_1": A, "pressure_2": B, "x": BENT, "y": TURNED, "vx": np.gradient(BENT)},
         ["pressure_1", "pressure_2"], [], ["x", "y"], "1", "1"),
@@ -215,6 +218,20 @@ def test_units_of_a_robot_are_those_of_the_titles_and_doubted_where_they_are_amb
     )
     assert (guess.robot.motors.unit, guess.robot.outputs.unit) == taken_units
     assert [doubt.about for doubt in guess.doubts] == ["robot", *doubted]
+
+
+@pytest.mark.parametrize("title", ["time_s", "time [s]", "t_s"])
+def test_a_clock_of_two_seconds_is_as_titled_and_doubted(tmp_path: Path, title: str) -> None:
+    guess = guess_robot(write(tmp_path / "log.csv", {title: 100.0 * TIME, "cmd [V]": A, "x [mm]": ONE}))
+    assert import_log(tmp_path / "log.csv", guess.layout).recording.sample_time == pytest.approx(2.0, rel=1e-6)
+    assert any(doubt.channels == ("time",) for doubt in guess.doubts)
+
+
+def test_names_keep_the_letters_under_accents_and_another_unit_is_the_reason(tmp_path: Path) -> None:
+    columns = {"time [s]": TIME, "Düse [V]": A, "Krümmung [mm]": ONE, "x [mm]": BENT, "twist [deg]": TURNED}
+    guess = guess_robot(write(tmp_path / "log.csv", columns))
+    assert (guess.robot.motors.names, guess.robot.outputs.names) == (("Duse",), ("Krummung", "x"))
+    assert any(line.startswith("left out: twist [deg]: of another quantity than") for line in guess.lines)
 
 
 @pytest.mark.parametrize(("title", "numbers", "doubted"), [("min", 1.0 / 60.0, False), ("ms", 1.0, True)])

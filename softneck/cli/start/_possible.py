@@ -147,9 +147,9 @@ def _rest(robot: Robot, recordings: Sequence[Recording]) -> tuple[dict[str, Entr
         return {}, {}
     means = np.mean(set_points, axis=0), np.nanmean(outputs, axis=0)
     units = to_si(robot.motors.unit)[0], to_si(robot.outputs.unit)[0]
-    why = "the mean of the recordings: steps of tests start there"
     found = [[_digits(value / unit) for value in mean] for mean, unit in zip(means, units, strict=True)]
-    return {"rest": (found[0], 60, why)}, {"rest": (found[1], 60, why)}
+    motors, outputs = (f"the mean of the {what}: steps of tests start there" for what in ("set-points", "outputs"))
+    return {"rest": (found[0], 60, motors)}, {"rest": (found[1], 60, outputs)}
 
 
 def _add(file: Path, name: str, entries: dict[str, Entry]) -> None:

@@ -244,7 +244,7 @@ def _check_fmus(parts: Mapping[str, Part], robot: Robot) -> None:
         if digest and digest != robot.hash:
             raise SettingsError(
                 f"[{name}] is an FMU of robot `{whose}` ({digest[:8]}) and the loop of robot {robot.label()}; use "
-                "parts of one robot, or set `robot`."
+                "parts of one robot, or name it: `robot` in a loop file, --robot for an SSP file."
             )
 
 

@@ -34,7 +34,8 @@ def limit_ports(starts: tuple[float, float, float, float, float], robot: Robot =
 
     def port(name: str, start: float, low: float, most: float, what: str = "", per: str = "") -> Port:
         return Port(name=name, unit=unit + per, start=start, minimum=size * low if bounded or low == 0.0 else None,
-                    maximum=size * most if bounded else None, description=what)  # fmt: skip
+                    maximum=size * most if bounded else None, description=what,
+                    display_unit="" if per else robot.motors.shown)  # fmt: skip
 
     return (
         port("position_limit", position, smallest, MAX_MOTOR),
@@ -196,11 +197,12 @@ class ControllerLimits:
         most = min(self.robot.motors.rate_limit or (0.0,))
         allowed = f"; its robot allows {most:g} {unit}/s" if most > slew * (1.0 + 1e-9) else ""
         rules = [("no motor below", self.least_position), ("co-contraction at least", self.least_cocontraction)]
+        what = "motors" if self.robot.tendon_angles is None else "tendons kept taut"
         taut = [f"{rule} {limit / factor:g} {unit}" for rule, limit in rules if limit > -self.position_limit]
         return [
             f"  limits: {ends}slew {slew:g} {unit}/s ({slew * sample_time:g} {unit} per sample{allowed}), "
             f"lead {lead:g} {unit} before the motors",
-            *([f"  tendons kept taut: {', '.join(taut)}"] if taut else []),
+            *([f"  {what}: {', '.join(taut)}"] if taut else []),
         ]
 
 

@@ -355,13 +355,12 @@ class NmpcController(ReprMixin):
             "one iteration a sample",
         ]
         lines += self.limits.lines(self.sample_time)
-        shown, motor = to_si(robot.outputs.display_unit)[0], to_si(robot.motors.unit)[0]
+        factor, unit = robot.shown_gain
         for axis in robot.outputs.names:
             f = self.found[axis]
             lines.append(
-                f"  {axis}: the model near rest is {f['static_gain'] * motor / shown:.3g} "
-                f"{robot.outputs.display_unit}/{robot.motors.unit}, pole {f['pole']:.3g} 1/s, dead time "
-                f"{1e3 * f['delay'] * self.sample_time:g} ms"
+                f"  {axis}: the model near rest is {factor * f['static_gain']:.3g} {unit}, pole "
+                f"{f['pole']:.3g} 1/s, dead time {1e3 * f['delay'] * self.sample_time:g} ms"
             )
         return "\n".join(lines)
 

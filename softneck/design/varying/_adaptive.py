@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import Matrix, ReprMixin, SettingsError, Vector, require_between, to_si, write_archive
+from softneck.core import Matrix, ReprMixin, SettingsError, Vector, require_between, write_archive
 from softneck.estimation import NECK_REACH, AxisPlant, linear_reach
 from softneck.robot import Robot, Scaling, find_robot
 from softneck.runtime import Block, Port, State, sized_name
@@ -359,8 +359,8 @@ def _pole(plant: AxisPlant) -> float:
 
 
 def _line(axis: str, found: dict[str, float], robot: Robot) -> str:
-    per, unit = to_si(robot.outputs.display_unit)[0], f"{robot.outputs.display_unit}/{robot.motors.unit}"
-    gain = found["static_gain"] / per * to_si(robot.motors.unit)[0]
+    per, unit = robot.shown_gain
+    gain = per * found["static_gain"]
     return (
         f"  {axis}: starts from {gain:.3g} {unit}, pole {found['pole']:.3g} 1/s, dead time "
         f"{1e3 * found['dead_time_s']:g} ms; kappa {found['kappa']:.3g}; largest Ms of the nominal gains in the box "

@@ -27,11 +27,10 @@ from softneck.core import (
 from softneck.signals import Recording, assess_quality
 
 from ..models._drive import fit_drive
-from ..models._fitting import ScaledData, delay_samples, free_run_fit, training_recording
+from ..models._fitting import MAX_DELAY, ScaledData, delay_samples, free_run_fit, training_recording
 from ..models._linear_systems import axes_system, lss_arrays
 from ..models._model import Model
 from ._regression import (
-    MAX_DELAY,
     arx_rows,
     axis_arrays,
     check_delays,
@@ -59,33 +58,40 @@ _LOG_PRECISION = 36.0
 class OutputErrorFit:
     """One axis at one dead time: f (nf,) without its leading one, b (nb,), the sum of squared errors `cost`.
 
-    covariance: (nf + nb, nf + nb) of (f, b), if the output noise is white.
+    covariance: (nf + nb, nf + nb) of (f, b), if the output noise is white; constant: of the output.
     """
 
     f: Vector
     b: Vector
     cost: float
     covariance: Matrix
+    constant: float
 
 
-def fit_output_error(runs: Runs, nf: int, nb: int, d: int, starts: Sequence[Vector]) -> OutputErrorFit | None:
-    """Fit one axis at dead time `d` from all `starts` (nf,); None where no fit is stable."""
+def fit_output_error(
+    runs: Runs, nf: int, nb: int, d: int, starts: Sequence[Vector], *, constant: bool = False
+) -> OutputErrorFit | None:
+    """Fit one axis at dead time `d` from all `starts` (nf,); None where no fit is stable.
+
+    `constant`: outputs are off by a constant. A mean is not that constant where a run starts away from equilibrium.
+    """
     best: tuple[float, Vector] | None = None
     radius = largest_radius(runs)
     for start in starts:
-        found = _search(runs, nb, d, _limit_poles(start, radius), radius)
+        found = _search(runs, nb, d, _limit_poles(start, radius), radius, constant)
         if best is None or found[0] < best[0]:
             best = found
     if best is None or not np.isfinite(best[0]):
         return None
     f = best[1]
-    X, y, bases = _columns(runs, f, nb, d)
+    X, y, bases = _columns(runs, f, nb, d, constant)
     b = np.linalg.lstsq(X, y)[0]
     r = y - X @ b
-    J = np.column_stack([_pole_columns(runs, f, b, d, bases), X])
+    J = np.column_stack([_pole_columns(runs, f, b, nb, d, bases), X])
     cost = float(r @ r)
     covariance = cost / max(y.size - nf - nb - nf * len(runs), 1) * np.linalg.pinv(J.T @ J, hermitian=True)
-    return OutputErrorFit(f=f, b=b, cost=cost, covariance=covariance)
+    covariance = covariance[: nf + nb, : nf + nb]
+    return OutputErrorFit(f=f, b=b[:nb], cost=cost, covariance=covariance, constant=float(b[nb:].sum()))
 
 
 def default_starts(nf: int, sample_time: float, least_squares: Vector | None) -> list[Vector]:
@@ -116,9 +122,9 @@ def _bounds(poles: np.ndarray, radius: float) -> Vector:
     return np.where(turns & (np.imag(poles) != 0.0), radius ** (_RINGING_DECAY / _RUNS_PER_TIME_CONSTANT), radius)
 
 
-def _search(runs: Runs, nb: int, d: int, f: Vector, radius: float) -> tuple[float, Vector]:
+def _search(runs: Runs, nb: int, d: int, f: Vector, radius: float, constant: bool) -> tuple[float, Vector]:
     """Minimise the projected cost over f by Levenberg and Marquardt, with Kaufman's derivative."""
-    cost, r, J = _project_linear(runs, f, nb, d)
+    cost, r, J = _project_linear(runs, f, nb, d, constant)
     damping = 1e-3
     for _ in range(_MAX_ITERATIONS):
         H, g = J.T @ J, J.T @ r
@@ -127,7 +133,7 @@ def _search(runs: Runs, nb: int, d: int, f: Vector, radius: float) -> tuple[floa
             step = np.linalg.solve(H + damping * np.diag(np.maximum(np.diag(H), 1e-300)), g)
             trial = f + step
             if not _exceeds(trial, radius):
-                new = _project_linear(runs, trial, nb, d)
+                new = _project_linear(runs, trial, nb, d, constant)
                 if new[0] < cost:
                     gained = cost - new[0]
                     f, (cost, r, J) = trial, new
@@ -139,38 +145,40 @@ def _search(runs: Runs, nb: int, d: int, f: Vector, radius: float) -> tuple[floa
     return cost, f
 
 
-def _project_linear(runs: Runs, f: Vector, nb: int, d: int) -> tuple[float, Vector, Matrix]:
-    """Return cost, residual and derivative of the prediction by f, with b and the starts eliminated."""
-    X, y, starts = _columns(runs, f, nb, d)
+def _project_linear(runs: Runs, f: Vector, nb: int, d: int, constant: bool) -> tuple[float, Vector, Matrix]:
+    """Return cost, residual and derivative of the prediction by f, with b, constant and starts eliminated."""
+    X, y, starts = _columns(runs, f, nb, d, constant)
     Q = _orthonormal_basis(X)
     r = y - Q @ (Q.T @ y)
     b = np.linalg.lstsq(X, y)[0]
-    S = _pole_columns(runs, f, b, d, starts)
+    S = _pole_columns(runs, f, b, nb, d, starts)
     return float(r @ r), r, S - Q @ (Q.T @ S)
 
 
-def _columns(runs: Runs, f: Vector, nb: int, d: int) -> tuple[Matrix, Vector, list[Matrix]]:
-    """Return regressors of b (rows, nb) and outputs (rows,) without starts, and each run's basis of starts."""
+def _columns(runs: Runs, f: Vector, nb: int, d: int, constant: bool) -> tuple[Matrix, Vector, list[Matrix]]:
+    """Return regressors of b and constant (rows, nb or nb + 1), outputs (rows,), and each run's basis of starts."""
     parts, targets, bases = [], [], []
     for u, y in runs:
         there = np.isfinite(y)
         response = _start_responses(f, u.size)
         Q = _orthonormal_basis(response[there[: len(response)]])
-        parts.append(_project_off(Q, _input_columns(u, f, nb, d)[there]))
+        X = _input_columns(u, f, nb, d)
+        X = np.column_stack([X, np.ones(len(X))]) if constant else X
+        parts.append(_project_off(Q, X[there]))
         targets.append(_project_off(Q, y[there]))
         bases.append(Q)
     return np.concatenate(parts), np.concatenate(targets), bases
 
 
-def _pole_columns(runs: Runs, f: Vector, b: Vector, d: int, bases: list[Matrix]) -> Matrix:
-    """Return the derivative of the output by f, `-q^-i / F y`, without the starts' part."""
+def _pole_columns(runs: Runs, f: Vector, b: Vector, nb: int, d: int, bases: list[Matrix]) -> Matrix:
+    """Return the derivative of the output by f, `-q^-i / F y`, without the starts' part; b (nb,), then a constant."""
     F = np.concatenate([[1.0], f])
     parts = []
     for (u, y), Q in zip(runs, bases, strict=True):
         there = np.isfinite(y)
-        forced = _input_columns(u, f, b.size, d) @ b
-        # F filters the whole output, with its own start.
-        left = y[there] - forced[there]
+        forced = _input_columns(u, f, nb, d) @ b[:nb]
+        # F filters the whole output but its constant, with its own start.
+        left = y[there] - forced[there] - b[nb:].sum()
         response = _start_responses(f, u.size)
         n = len(response)
         output = forced
@@ -320,14 +328,14 @@ class OutputError:
 
     def _fit(self, recording: Recording, modes: Mapping[str, tuple[float, float]], progress: Progress) -> Model:
         scaled = ScaledData.of(recording)
-        settings = replace(self, delay=scaled.seconds(self.delay), max_delay=scaled.seconds(self.max_delay, MAX_DELAY))
+        settings = replace(self, delay=scaled.seconds(self.delay), max_delay=scaled.longest_delay(self.max_delay))
         names, Ts, inputs = scaled.directions.names, scaled.data.sample_time, _axis_runs(scaled, self.source)
         found: list[OutputErrorFit] = []
         delays, curves, beside = [], {}, {}
         for axis, name in enumerate(names):
             progress(axis / len(inputs), name)
             start = _mode_start(modes.get(name), self._poles, recording.sample_time)
-            fit, d, curves[name], beside[name] = settings._fit_axis(Ts, inputs[axis], name, start)
+            fit, d, curves[name], beside[name] = settings._fit_axis(Ts, inputs[axis], name, start, scaled.has_offset)
             found.append(fit)
             delays.append(d)
         arrays, functions = self._arrays(scaled, found, delays)
@@ -376,7 +384,7 @@ class OutputError:
         return arrays, functions_found(scaled, a, b, delays)
 
     def _fit_axis(
-        self, sample_time: float, runs: list[tuple[Vector, Vector]], name: str, start: list[Vector]
+        self, sample_time: float, runs: list[tuple[Vector, Vector]], name: str, start: list[Vector], constant: bool
     ) -> tuple[OutputErrorFit, int, list[list[float]], dict[str, Any]]:
         """Return the best fit, its dead time, the cost curve (delay [s], fit [%], one-step rms) and ARX findings."""
         columns = [(y[:, None], u[:, None]) for u, y in runs]
@@ -392,7 +400,7 @@ class OutputError:
             # The optimum of one dead time is a good start for the next.
             others = [*start, *default_starts(self._poles, sample_time, arx[: self._poles])]
             starts = [*last, arx[: self._poles]] if last else others
-            fit = fit_output_error(runs, self._poles, self._numerator, d, starts)
+            fit = fit_output_error(runs, self._poles, self._numerator, d, starts, constant=constant)
             if fit is None:
                 continue
             last = [fit.f]
@@ -404,9 +412,8 @@ class OutputError:
         if best is None:
             raise DataError(f"no dead time gives a stable model of {name}; record with more excitation.")
         d = best[1]
-        again = fit_output_error(
-            runs, self._poles, self._numerator, d, [best[0].f, *start, *default_starts(self._poles, sample_time, None)]
-        )
+        starts = [best[0].f, *start, *default_starts(self._poles, sample_time, None)]
+        again = fit_output_error(runs, self._poles, self._numerator, d, starts, constant=constant)
         fit = again if again is not None and again.cost < best[0].cost else best[0]
         return fit, d, curve, _least_squares_findings(columns, self._poles, self._numerator, d, sample_time)
 
@@ -419,6 +426,7 @@ class OutputError:
         search = SrivcFitOptions(
             sample_time=sample_time, max_delay=self.max_delay or MAX_DELAY, free_delay=self.delay is None
         )
+        runs = [(u, y - fit.constant) for u, y in runs]
         pole, late = -float(np.log(-fit.f[0])) / sample_time, delay * sample_time
         # The cost has a kink at each whole sample of dead time, so the search also starts half a sample beside it.
         sides = (-0.5, 0.5) if self.delay is None else ()

@@ -17,9 +17,6 @@ from ..models._fitting import ScaledData
 from ..models._linear_systems import history_array, system_of
 from ..models._model import WARM_UP, Model
 
-# Default end of the search for the dead time [scaled s]: one and a half time constants.
-MAX_DELAY = 0.3
-
 
 def check_delays(delay: float | None, max_delay: float | None) -> None:
     """Raise SettingsError for a dead time or a bound on it that is out of range."""

@@ -26,12 +26,11 @@ from softneck.runtime import load_functions
 from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
 
 from ..models._drive import DriveModel, fit_drive
-from ..models._fitting import ScaledData, delay_samples, free_run_fit, training_recording
+from ..models._fitting import MAX_DELAY, ScaledData, delay_samples, free_run_fit, training_recording
 from ..models._linear_systems import lss_arrays, varx_system
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
 from ._regression import (
-    MAX_DELAY,
     arx_rows,
     axis_arrays,
     check_delays,
@@ -240,7 +239,7 @@ class Rls:
             DataError: too short, constant, without two usable rows, or not enough excitation.
         """
         scaled = ScaledData.of(training_recording(recordings))
-        settings = replace(self, delay=scaled.seconds(self.delay), max_delay=scaled.seconds(self.max_delay, MAX_DELAY))
+        settings = replace(self, delay=scaled.seconds(self.delay), max_delay=scaled.longest_delay(self.max_delay))
         fit = settings._fit_siso if self.structure == "siso" else settings._fit_motors
         arrays, findings = fit(scaled, progress)
         if scaled.has_offset:

@@ -246,12 +246,19 @@ def _motor_port(robot: Robot, name: str, description: str, *, missing: bool = Fa
 def parameter_ports(robot: Robot, arrays: Mapping[str, np.ndarray]) -> tuple[Port, ...]:
     """Return the parameters: start values, `use_measurement`, noise, and the payload where the model depends on it."""
     known, names, unit = payloads(arrays), robot.outputs.names, to_si(robot.outputs.unit)[1]
-    measured = "false: simulation (paper, Fig. 3b); true: from measured angles and motors (Fig. 3a)"
+    measured = "false: simulation; true: from measured outputs and motors (paper, Fig. 3b and 3a)"
     noise = f"Standard deviation of the noise on {' and '.join(names)}"
-    ports = [_output_port(robot, f"{name}_start", f"{name.capitalize()} at the start") for name in names]
+    ports = [_output_port(robot, f"{name}_start", f"{name[0].upper()}{name[1:]} at the start") for name in names]
     ports += [
         Port(name="use_measurement", description=measured, boolean=True, minimum=0.0, maximum=1.0),
-        Port(name="noise_std", unit=unit, description=noise, minimum=0.0, maximum=0.5 if unit == "rad" else None),
+        Port(
+            name="noise_std",
+            unit=unit,
+            description=noise,
+            minimum=0.0,
+            maximum=0.5 if unit == "rad" else None,
+            display_unit=robot.outputs.shown,
+        ),
         Port(name="noise_seed", description="Seed of that noise", minimum=0.0, maximum=2147483647.0, integer=True),
     ]
     if known is not None:

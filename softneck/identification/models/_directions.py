@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 # Number of time constants tried, from half a sample to a third of the longest run (beyond that all is drift).
 _TIME_CONSTANT_COUNT = 40
-# Then dead times are tried up to 1.5 of the time constant found without any, in at most 20 steps.
+# Then dead times are tried up to 1.5 of the time constant found without any, in at most 20 steps, and on while the
+# last is the best.
 _MAX_DEAD_TIME, _MAX_DEAD_TIME_STEPS = 1.5, 20
 # Relative singular value below which motions count as dependent; least squares then takes the smallest weights.
 _RANK_TOLERANCE = 1e-6
@@ -33,7 +34,8 @@ _RANK_TOLERANCE = 1e-6
 class Directions:
     """Weights (outputs, motors) of the redefined inputs and time constants `seconds` (outputs,) of a robot.
 
-    learned: whether from data; given: (inputs, motors) T of Eq. 9-11 from the robot file, co-contraction last.
+    learned: whether from data; given: (inputs, motors) T of Eq. 9-11 from the robot file, co-contraction last;
+    dead_time: the longest that was estimated [s].
     """
 
     names: tuple[str, ...]
@@ -41,6 +43,7 @@ class Directions:
     seconds: Vector
     learned: bool
     given: Matrix | None = None
+    dead_time: float = 0.0
 
     @property
     def redefinition(self) -> Matrix:
@@ -79,25 +82,28 @@ def directions_of(recording: Recording, motors: list[Matrix], robot: Robot | Non
     """
     robot = robot or recording.robot
     names, given = robot.outputs.names, robot.weights()
-    weights, seconds = given, np.full(len(names), robot.time_constant_s or NECK_SECONDS)
+    weights, seconds, late = given, np.full(len(names), robot.time_constant_s or NECK_SECONDS), 0.0
     if given is None or robot.time_constant_s is None:
         found = [_fit_direction(recording, motors, axis, given) for axis in range(len(names))]
-        weights = np.array([row for row, _ in found]) if given is None else given
+        weights = np.array([row for row, *_ in found]) if given is None else given
+        late = recording.sample_time * max(late for *_, late in found)
         if robot.time_constant_s is None:
-            seconds = recording.sample_time * np.array([samples for _, samples in found])
+            seconds = recording.sample_time * np.array([samples for _, samples, _ in found])
     T = None if given is None else robot.redefinition()[0]
-    return Directions(names, np.asarray(weights), seconds, given is None, T)
+    return Directions(names, np.asarray(weights), seconds, given is None, T, late)
 
 
-def _fit_direction(recording: Recording, motors: list[Matrix], axis: int, given: Matrix | None) -> tuple[Vector, float]:
-    """Estimate the weights (motors,) of length 1 that an output follows, and its time constant in samples."""
+def _fit_direction(
+    recording: Recording, motors: list[Matrix], axis: int, given: Matrix | None
+) -> tuple[Vector, float, int]:
+    """Estimate the weights (motors,) of length 1 that an output follows, its time constant and dead time in samples."""
     inputs = motors if given is None else [U @ given[[axis]].T for U in motors]
-    samples, weights = _fit_low_pass(inputs, [run.outputs[:, axis] for run in recording.runs()])
+    samples, weights, late = _fit_low_pass(inputs, [run.outputs[:, axis] for run in recording.runs()])
     size = float(np.linalg.norm(weights))
     if not size > 0.0:
         name = recording.robot.outputs.names[axis]
         raise DataError(f"`{name}` follows no motor; is its sensor connected, and did the motors move?")
-    return weights / size, samples
+    return weights / size, samples, late
 
 
 def time_constant_of(source: Recording | Model) -> float | None:
@@ -122,8 +128,8 @@ def bandwidth_of(recording: Recording) -> float | None:
     return None if seconds is None else BANDWIDTH * (NECK_SECONDS / seconds)
 
 
-def _fit_low_pass(inputs: Sequence[Matrix], outputs: Sequence[Vector]) -> tuple[float, Vector]:
-    """Fit a low-pass filter with dead time over all inputs; return time constant [samples] and weights (motors,)."""
+def _fit_low_pass(inputs: Sequence[Matrix], outputs: Sequence[Vector]) -> tuple[float, Vector, int]:
+    """Fit a low-pass filter over all inputs; return time constant, weights (motors,) and dead time, in samples."""
     from scipy.optimize import minimize_scalar
 
     longest = max(len(U) for U in inputs)
@@ -141,15 +147,16 @@ def _fit_low_pass(inputs: Sequence[Matrix], outputs: Sequence[Vector]) -> tuple[
     ladder = np.geomspace(0.5, longest / 3.0, _TIME_CONSTANT_COUNT)
     tau = float(min(ladder, key=lambda tau: fit(tau, 0)[0]))
     most = int(min(_MAX_DEAD_TIME * tau, longest / 3.0))
-    best = (np.inf, tau, 0)
-    for late in range(0, most + 1, max(most // _MAX_DEAD_TIME_STEPS, 1)):
+    best, late, step = (np.inf, tau, 0), 0, max(most // _MAX_DEAD_TIME_STEPS, 1)
+    while late <= most or (late <= longest / 3.0 and best[2] == late - step):
         # With dead time the time constant is shorter than the one found without.
         bounds = np.log(tau / 8.0), np.log(2.0 * tau)
         found: Any = minimize_scalar(
             lambda x, late=late: fit(np.exp(x), late)[0], method="bounded", bounds=bounds, options={"xatol": 1e-3}
         )
         best = min(best, (float(found.fun), float(np.exp(found.x)), late))
-    return best[1], fit(best[1], best[2])[1]
+        late += step
+    return best[1], fit(best[1], best[2])[1], best[2]
 
 
 def _independent(weights: Matrix) -> Matrix:

@@ -99,6 +99,10 @@ def _mix(x: np.ndarray) -> np.ndarray:
     return x ^ (x >> np.uint64(31))
 
 
+# Default end of the search for the dead time [scaled s]: one and a half time constants.
+MAX_DELAY = 0.3
+
+
 def delay_samples(
     delay: float | None, max_delay: float, sample_time: float, runs: Sequence[tuple[Matrix, Matrix]]
 ) -> list[int]:
@@ -234,7 +238,7 @@ class ScaledData:
         plain = scale_recording(recording, replace(scaling, second=1.0))
         found = directions_of(plain, [run.set_points for run in plain.runs()], robot)
         scaling = replace(scaling, second=found.time_constant / NECK_SECONDS)
-        directions = replace(found, seconds=found.seconds / scaling.second)
+        directions = replace(found, seconds=found.seconds / scaling.second, dead_time=found.dead_time / scaling.second)
         return cls(recording, scale_recording(recording, scaling), scaling, directions)
 
     @property
@@ -269,6 +273,11 @@ class ScaledData:
     def seconds(self, setting: float | None, default: float | None = None) -> float | None:
         """Return a setting [s] in scaled seconds; the default where it is None."""
         return default if setting is None else self.scaling.scale_seconds(setting)
+
+    def longest_delay(self, setting: float | None) -> float:
+        """Return the end of a search for the dead time in scaled seconds; of a long one half as much again."""
+        dead_time = 1.5 * self.directions.dead_time
+        return max(MAX_DELAY, dead_time) if setting is None else self.scaling.scale_seconds(setting)
 
     def findings(self) -> dict[str, object]:
         """Return the directions and time constants in SI where they were learned."""

@@ -237,7 +237,10 @@ def _blank_extreme_motions(recording: Recording, slow: float) -> tuple[Recording
 
 def _largest_rows(recording: Recording, size: Vector, reach: int) -> np.ndarray:
     """Return (time,) the rows with the largest `size`, and those near them in their run."""
-    inside = size > np.quantile(size, 1.0 - _REGION)
+    edge = np.quantile(size, 1.0 - _REGION)
+    inside = size > edge
+    if not inside.any() and 2 * (size == edge).sum() < size.size:
+        inside = size == edge  # steps of few levels: the largest level
     near = np.ones(2 * reach + 1)
     parts = np.split(inside, np.cumsum([len(run) for run in recording.runs()])[:-1])
     return np.concatenate([np.convolve(part, near)[reach : reach + part.size] > 0 for part in parts])

@@ -139,19 +139,18 @@ def describe(model: Any) -> list[str]:
 
 
 def _describe_axis(model: Any, name: str) -> str:
-    outputs, motors = model.robot.outputs, model.robot.motors
-    per, unit = to_si(motors.unit)[0] / to_si(outputs.display_unit)[0], f"{outputs.display_unit}/{motors.unit}"
+    per, unit = model.robot.shown_gain
     a, b, delay = axis_functions(model)[name]
     numbers = one_pole(model.sample_time, a, b, delay)
     if numbers is None:
         poles, gain = np.roots([1.0, *a]), per * b.sum() / (1.0 + a.sum())
         return (
             f"{name}: discrete poles {np.array2string(poles, precision=4)}, "
-            f"static gain {gain:.3f} {unit}, dead time {delay * model.sample_time:.3g} s"
+            f"static gain {gain:.4g} {unit}, dead time {delay * model.sample_time:.3g} s"
         )
     K, p, L = numbers
     gain = per * K / p
-    return f"{name}: G(s) = exp(-{L:.3g} s) {per * K:.3f}/(s + {p:.3f}) {unit}, static gain {gain:.3f}"
+    return f"{name}: G(s) = exp(-{L:.3g} s) {per * K:.4g}/(s + {p:.4g}) {unit}, static gain {gain:.4g}"
 
 
 def continuous_parameters(

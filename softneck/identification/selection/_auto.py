@@ -490,8 +490,9 @@ class _Race:
 
 def _with(one: KindTrial, found: Mapping[str, tuple[Fits, float]]) -> KindTrial:
     """Return the trial with more scores, each with its standard error."""
-    outputs = {name: fits for name, (fits, _) in found.items()}
-    left_out = {name: _mean_of_moved(fits) for name, fits in outputs.items()}
+    # A part in which no output moved says nothing of any kind.
+    outputs = {name: fits for name, (fits, _) in found.items() if not np.isnan([*fits.values()]).all()}
+    left_out = {name: float(np.nanmean([*fits.values()])) for name, fits in outputs.items()}
     errors = {name: error for name, (_, error) in found.items() if np.isfinite(error)}
     return replace(
         one,
@@ -499,11 +500,6 @@ def _with(one: KindTrial, found: Mapping[str, tuple[Fits, float]]) -> KindTrial:
         errors={**one.errors, **errors},
         outputs={**one.outputs, **outputs},
     )
-
-
-def _mean_of_moved(fits: Fits) -> float:
-    known = [fit for fit in fits.values() if not np.isnan(fit)]
-    return float(np.mean(known)) if known else float("-inf")
 
 
 def _settings(kind: str, seed: int, other: Mapping[str, Any]) -> Any:

@@ -413,7 +413,7 @@ class _Motions:
         for number, (name, _, _) in enumerate(_CLASSES):
             chosen = np.flatnonzero(self.classes == number)
             at = np.isin(self.groups, chosen)
-            if chosen.size:
+            if self.motion[chosen].max(initial=0.0) > 0.0:  # steps of few levels rest in all of the smallest
                 rows.append({
                     "class": name, "motion": float(self.motion[chosen].max()), "covered": float(inside[at].mean()),
                     "width": float(0.5 * (high - low)[at].mean()), "segments": int(chosen.size),

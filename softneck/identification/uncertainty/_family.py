@@ -184,7 +184,7 @@ class Family(ReprMixin):
         """Return a few lines, in the units in which people see outputs and motors."""
         robot = self.robot
         shown, per = robot.outputs.display_unit, robot.motors.unit
-        factor, unit = to_si(per)[0] / to_si(shown)[0], f"{shown}/{per}"
+        factor, unit = robot.shown_gain
         lines = [
             f"family of {self.findings.get('recordings', 0)} recordings of robot {robot.label()}, "
             f"{1e3 * self.sample_time:g} ms"

@@ -25,10 +25,9 @@ from softneck.robot import Scaling
 from softneck.signals import Recording, concatenate, conditions
 
 from ..linear._oe import SOURCES
-from ..linear._regression import MAX_DELAY
 from ..linear._srivc_fit import Continuous, SrivcFitOptions
 from ..models._directions import Directions
-from ..models._fitting import ScaledData, check_training
+from ..models._fitting import MAX_DELAY, ScaledData, check_training
 from ._family import SCOPES, AxisFamily, Family, one_pole, relative_errors
 from ._local_models import Local, Window, axis_inputs, fit_compression, fit_local, unit_response, windows
 from ._measured import (
@@ -241,7 +240,7 @@ class FamilySettings:
         if self.window is not None:
             ends = scaling.unscale_seconds(_MIN_WINDOW_S), scaling.unscale_seconds(_MAX_WINDOW_S)
             require_between("window", self.window, *ends, "s")
-        times = {"window": data.seconds(self.window, _WINDOW_S), "max_delay": data.seconds(self.max_delay, MAX_DELAY)}
+        times = {"window": data.seconds(self.window, _WINDOW_S), "max_delay": data.longest_delay(self.max_delay)}
         named = list(names) if names is not None else [f"recording {k + 1}" for k in range(len(parts))]
         if len(named) != len(parts):
             raise DataError(f"{len(named)} names were given for {len(parts)} recordings; give one for each.")

@@ -67,7 +67,10 @@ def _is_german(title: str) -> bool:
 def _parts(word: str) -> list[str]:
     if word in _TRANSLATED:
         return [_TRANSLATED[word]]
-    return [english for part in _split(word) if (english := _LINK.get(part, _TRANSLATED.get(part, part)))]
+    parts = _split(word)
+    if len(parts) == 1:
+        return parts  # `s` alone is a unit, no link
+    return [english for part in parts if (english := _LINK.get(part, _TRANSLATED.get(part, part)))]
 
 
 def _split(word: str) -> list[str]:
@@ -86,12 +89,12 @@ def _split(word: str) -> list[str]:
 
 # Units that are words as well: only in brackets, and as the last word of no title.
 _WORDS_TOO = {"in", "ma", "pa", "mn", "kn", "mt", "um", "atm", "day", "tag"}
-#: Of temperatures, which no factor makes SI.
+#: Of temperatures, known units or not.
 TEMPERATURES = {"c", "degc", "°c", "degf", "°f", "f", "k"}
 # What stands where a unit would, and is none: an encoder's counts, numbers without a unit.
 _NO_UNITS = {"", "-", "1", "counts", "count", "ticks", "inc", "lsb", "raw", "a.u.", "au", "n/a"}
 # `_V` and `_kPa` at the end of a title; in lower case some are words.
-_CAPITAL = re.compile(r"[_ ](V|A|N|W|Nm|Pa|kPa|hPa|MPa|mmHg)$")
+_CAPITAL = re.compile(r"[_ ](V|A|N|W|Nm|Pa|kPa|hPa|MPa|mmHg|degC|°C)$")
 # `setpoint / rad`, as DIN 1313 writes units of axes.
 _SLASH = re.compile(r"\s/\s*(\S+)\s*$")
 _BRACKET = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")

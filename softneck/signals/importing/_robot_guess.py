@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import unicodedata
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -370,7 +371,8 @@ def _names(titles: Sequence[Column]) -> list[str]:
     """Return titles as unique names of letters, digits and _ that start with a letter."""
     names: list[str] = []
     for number, title in enumerate(titles):
-        name = re.sub(r"\W+", "_", _UNIT.sub("", str(title)).strip(), flags=re.ASCII).strip("_") or f"c{number + 1}"
+        title = "".join(c for c in unicodedata.normalize("NFKD", str(title)) if not unicodedata.combining(c))
+        name = re.sub(r"\W+", "_", _UNIT.sub("", title).strip(), flags=re.ASCII).strip("_") or f"c{number + 1}"
         name = name if name[0].isalpha() else f"c_{name}"
         names.append(name if name not in names else f"{name}_{number + 1}")
     return names

@@ -51,6 +51,7 @@ _RATE = {"velocity", "vel", "speed", "rate", "omega", "acc", "accel", "accelerat
 _ASIDE = {"temperature", "temp", "amb", "ambient", "battery", "bat", "batt", "supply", "status", "state", "flag",
           "error", "err", "deviation", "residual", "mode", "humidity", "latency", "cpu", "fault", "alarm",
           "index", "idx", "row", "counter", "count", "id"}  # fmt: skip
+_WARM = {"temperature", "temp"}
 _PLACE = {"position", "pos", "angle"}
 # Words of which glued titles such as `Pcmd` and `Solldruck` consist, besides one leading letter.
 _KNOWN = _COMMAND | _MEASURED | _SENT | _ACTUATOR | _LOAD | _OUTPUT | _RATE | _ASIDE | _PLACE | {"p"}
@@ -62,6 +63,8 @@ _RATE_AGREES, _FEW_ROWS = 0.98, 20
 NOTHING_NEW = ("constant", "a copy", "exactly", "the rate")
 # Of an output's variance that the motors explain: less is no response.
 _LEAST_RESPONSE = 0.05
+# Of a temperature where nothing else is an output: a warm motor follows its set-points less.
+_HEATED = 0.5
 # Lags [samples] and poles of it, and rows enough to see it.
 _LAGS, _POLES, _FIT_ROWS = (0, 1, 3, 10, 30), (0.0, 0.5, 0.8, 0.9, 0.95, 0.98), 5000
 # A measured motor follows its set-point through such a lag; of two motors none explains the other so well.
@@ -355,6 +358,9 @@ def _outputs(
     sensors = [one for one in free if said[one].any({"force", "torque", "level"}) or said[one].quantity == "N"]
     inputs = np.column_stack([_filled(rows[one]) for one in found.motors]) if found.motors else None
     tiers = [tier for tier in (places, plain_ones, sensors, [one for one in free if said[one].measured]) if tier]
+    if not tiers and inputs is not None:  # a plate that is heated, not a warm motor
+        warm = [one for one in rest if said[one].any(_WARM) and _response(_filled(rows[one]), inputs) >= _HEATED]
+        return _most(warm, said)[:_MOST_OUTPUTS] if warm else []
     for columns in tiers:
         answers = {one: 1.0 if inputs is None else _response(_filled(rows[one]), inputs) for one in columns}
         follow = [one for one in columns if answers[one] >= _LEAST_RESPONSE]
@@ -423,6 +429,8 @@ def _tell(rest: Sequence[Column], said: Mapping[Column, _Words], found: Roles) -
             why = "a rate"
         elif w.load or w.actuator:
             why = "a quantity of the actuators that pairs with no motor's set-point"
+        elif w.place and found.outputs and w.kind != said[found.outputs[0]].kind:
+            why = f"of another quantity than {found.outputs[0]}, and outputs have one unit; --output names it instead"
         else:
             why = "neither motor nor output by title and unit"
         found.left_out[column] = why

@@ -13,9 +13,9 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from softneck.core import DataError, SettingsError, load
-from softneck.identification import OutputError, Rls, validate
+from softneck.identification import OutputError, Rls, choose, validate
 from softneck.identification.linear._oe import fit_output_error
-from softneck.identification.models._linear_systems import continuous_parameters
+from softneck.identification.models._linear_systems import axis_functions, continuous_parameters
 from softneck.robot import Robot
 from softneck.signals import Recording, concatenate, import_log, read_layout, redefine, signal
 
@@ -230,3 +230,48 @@ def test_a_lightly_damped_mode_has_two_poles_by_default(sample_time: float, unit
     assert fit is not None
     assert fit > 90.0
     assert OutputError(delay=0.0, nf=1).fit(r).settings["nf"] == 1
+
+
+def one_motor(u: np.ndarray, y: np.ndarray, sample_time: float, name: str = "plate") -> Recording:
+    robot = Robot.from_dict({
+        "name": name, "motors": {"names": ["heater"], "unit": "V"}, "outputs": {"names": ["height"], "unit": "mm"},
+        "directions": {"kind": "identified"},
+    })  # fmt: skip
+    return Recording.from_arrays(u[:, None], 1e-3 * y[:, None], sample_time=sample_time, robot=robot)
+
+
+def levels(rows: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(0.0, 5.0, rows), rng.integers(40, 150, rows))[:rows]
+
+
+def late(u: np.ndarray, samples: int) -> np.ndarray:
+    return np.concatenate([np.full(samples, u[0]), u])[: u.size]
+
+
+def test_a_run_that_starts_far_from_equilibrium_has_its_gain_pole_and_dead_time() -> None:
+    """The mean of the outputs is off by the start's transient, of 80 samples: as an offset it cost a sample."""
+    u, pole = levels(2000, 4), np.exp(-1.0 / 80.0)
+    y = 21.0 + np.asarray(lfilter([9.0 * (1.0 - pole)], [1.0, -pole], late(u, 6)))
+    [(a, b, dead)] = axis_functions(OutputError(max_delay=20.0).fit(one_motor(u, y, 2.0))).values()
+    assert dead == 5
+    # Gauss-Newton ends where a step gains less than 1e-10 of the cost, which is itself rounding.
+    np.testing.assert_allclose([*a, *b], [-pole, 9e-3 * (1.0 - pole)], rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", [OutputError(), Rls()], ids=["oe", "rls"])
+def test_a_dead_time_of_three_time_constants_is_found(kind: Any) -> None:
+    u = levels(1500, 8)
+    y = np.asarray(lfilter([0.1], [1.0, -0.9], late(u, 31)))
+    [(_, _, dead)] = axis_functions(kind.fit(one_motor(u, y, 0.02))).values()
+    assert dead == 30  # the search used to end at one and a half time constants, 15 samples
+
+
+@pytest.mark.parametrize("few", [[0.0, 2.0], [0.0, 1.0, 0.0, 2.0, 0.0, 3.0]], ids=["two levels", "four levels"])
+def test_kinds_are_compared_on_steps_of_few_levels(few: list[float]) -> None:
+    """No row is larger than the largest level: that part was empty, and every kind `diverged` on it."""
+    u = np.repeat(np.resize(few, 150), np.random.default_rng(1).integers(4, 12, 150))[:1000]
+    y = lfilter([0.0, 1.0], [1.0, -0.5], u) + 0.01 * np.random.default_rng(2).standard_normal(1000)
+    head, tail = one_motor(u, y, 0.1).split(0.7)
+    # The noise is a hundredth of the motion.
+    assert choose(head, tail, kinds=["oe", "rls"]).chosen.fit > 95.0

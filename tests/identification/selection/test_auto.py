@@ -679,10 +679,14 @@ def test_what_is_wary_of_a_ranking_is_said_of_it() -> None:
     assert _auto._failure_reasons([lost, KindTrial("oe", 0.0, failure="no")]) == "no"
     assert _auto._failure_reasons([lost, good]) == "nn: no; rls: its simulation diverged"
     assert _auto._progress_text("oe", []) == _auto._progress_text("oe", [lost]) == "oe"
-    # Outputs at rest have no fit; where none moves nothing is known.
-    nan = float("nan")
-    assert _auto._mean_of_moved({"pitch": 80.0, "roll": nan}) == 80.0
-    assert _auto._mean_of_moved({"pitch": nan}) == _auto._mean_of_moved({}) == float("-inf")
+    # Outputs at rest have no fit; a part in which none moves says nothing, of a diverged simulation it does.
+    nan, lost_fit = float("nan"), float("-inf")
+    still = {
+        "still": ({"pitch": nan}, nan),
+        "half": ({"pitch": 80.0, "roll": nan}, 0.0),
+        "lost": ({"a": lost_fit}, nan),
+    }
+    assert _auto._with(good, still).left_out == {HOLD_OUT: 70.0, "half": 80.0, "lost": lost_fit}
     told = _auto._with(good, {"a": (FITS, nan), "b": (FITS, 0.0)})
     assert (told.left_out, told.errors) == ({HOLD_OUT: 70.0, "a": 70.0, "b": 70.0}, {"b": 0.0})
 

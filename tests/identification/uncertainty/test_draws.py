@@ -518,6 +518,9 @@ def test_coverage_tells_the_largest_motion_the_mean_width_and_the_number_of_segm
     small, large = motions.coverage(Y, np.zeros(1), 0.0)
     assert small == {"class": "middle", "motion": 0.5, "covered": 1.0, "width": pytest.approx(0.15), "segments": 2}
     assert (large["width"], large["segments"], large["motion"]) == (pytest.approx(0.5), 1, 1.0)
+    # Steps of few levels rest in every segment of a class, whose width is no part of a motion.
+    still = replace(motions, motion=np.array([0.0, 0.0, 1.0]))
+    assert [row["class"] for row in still.coverage(Y, np.zeros(1), 0.0)] == ["large"]
 
 
 @pytest.mark.parametrize(
