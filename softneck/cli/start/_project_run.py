@@ -126,6 +126,8 @@ class ProjectRun:
         """Begin a step in a process of its own, if it is to be done and there is a core for it."""
         if step.key not in self.begun and not self._is_done(step) and core_count() > 1:
             words = ["-m", *step.command, *(["--json"] if self.as_json else [])]
+            if step.command[0] == "python":
+                words = [*step.command[1:]]
             self.begun[step.key] = _Process.of(words, step.makes, _hashes(step))
 
     def _was_begun(self, step: Step) -> bool:
