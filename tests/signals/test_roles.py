@@ -167,10 +167,17 @@ def test_what_moves_by_itself_is_no_output(tmp_path: Path) -> None:
 
 
 def test_references_and_angles_alone_are_no_robot(tmp_path: Path) -> None:
-    columns = {"time": TIME, "target_inclination": A, "sensor_inclination": ONE}
+    columns = {"time": TIME, "target_inclination": A, "sensor_inclination": ONE, "error": BENT}
     path = write(tmp_path / "log.csv", columns)
     assert not is_of_another_robot(path)
     with pytest.raises(DataError, match=r"no column was recognised as motor\. Name them: `softneck import"):
+        guess_robot(path)
+
+
+def test_a_log_with_too_few_columns_for_a_neck_names_those_it_has(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.csv", {"time": TIME, "supply valve": A, "y": ONE})
+    assert is_of_another_robot(path)
+    with pytest.raises(DataError, match=r"Name them: .*--output 'supply valve' --output y"):
         guess_robot(path)
 
 

@@ -276,8 +276,11 @@ class ScaledData:
 
     def longest_delay(self, setting: float | None) -> float:
         """Return the end of a search for the dead time in scaled seconds; of a long one half as much again."""
-        dead_time = 1.5 * self.directions.dead_time
-        return max(MAX_DELAY, dead_time) if setting is None else self.scaling.scale_seconds(setting)
+        if setting is not None:
+            return self.scaling.scale_seconds(setting)
+        # What lasts longer than a third of the longest run is a drift.
+        longest = max(map(len, self.data.runs())) * self.data.sample_time / 3.0
+        return min(max(MAX_DELAY, 1.5 * self.directions.dead_time), longest)
 
     def findings(self) -> dict[str, object]:
         """Return the directions and time constants in SI where they were learned."""

@@ -232,6 +232,12 @@ def axis_data(
         y.append(run.outputs[lag:, axis])
         first.append(np.arange(len(run) - lag) == 0)
         weight.append(weights[span][lag:])
+    if not X:
+        longest = max(map(len, recording.runs()))
+        raise DataError(
+            f"a network remembers {lag} samples of this robot, and the longest run to train or stop on has {longest}; "
+            "record longer, or give the robot's `time_constant_s`."
+        )
     measured, simulated, target = np.concatenate(X), np.concatenate(S), np.concatenate(y)
     if scale is None:
         x, t = measured[np.isfinite(measured).all(axis=1)], target[np.isfinite(target)]

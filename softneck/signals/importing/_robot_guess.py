@@ -24,7 +24,7 @@ from ._guess_names import by_names
 from ._guess_units import Unit, clock_unit, unread_clocks
 from ._layout import Column, Layout, Source, Term
 from ._roles import NOTHING_NEW, Roles, find_roles, may_be_motor, names_a_place
-from ._table_format import SniffResult, sniff
+from ._table_format import MIN_COLUMNS, SniffResult, sniff
 from .formats._text import DATE
 
 if TYPE_CHECKING:
@@ -71,6 +71,8 @@ def is_of_another_robot(path: str | Path) -> bool:
         angles = draft.quaternion is not None or any(name in draft.picks for name in _OF_A_NECK)
         if motors and angles:
             return False
+        if len(table.columns) < MIN_COLUMNS:
+            return True
         roles = find_roles(table, {})
         # Three motors are a neck's, unless titles name other outputs than angles.
         if motors and not any(names_a_place(table, column) for column in roles.outputs):

@@ -36,7 +36,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)", re
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
 _COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
 # Three motors and an angle; a recording of a neck has five channels and a time.
-_MIN_COLUMNS = 4
+MIN_COLUMNS = 4
 # Time, name and value of a table in long form.
 _LONG_COLUMNS = 3
 _NAMES = {"\t": "a tab", ";": "`;`", ",": "`,`", WHITESPACE: "blanks"}
@@ -76,7 +76,7 @@ class SniffResult:
         return bool(cells.isna().any())
 
 
-def sniff(path: str | Path, *, fewest: int = _MIN_COLUMNS) -> SniffResult:
+def sniff(path: str | Path, *, fewest: int = MIN_COLUMNS) -> SniffResult:
     """Detect the format of a log and read it; a recording of its robot needs at least `fewest` columns."""
     source = Path(path)
     raw, form, lines, units = _form(source, fewest)
@@ -98,9 +98,8 @@ def sniff(path: str | Path, *, fewest: int = _MIN_COLUMNS) -> SniffResult:
         else:
             columns[key] = values
     if len(columns) < fewest:
-        needed = "three set-points, pitch and roll" if fewest == _MIN_COLUMNS else "a set-point and an output at least"
         raise DataError(
-            f"{source}: has {len(columns)} column(s) of numbers; a recording needs {needed}. "
+            f"{source}: has {len(columns)} column(s) of numbers; a recording needs one for each set-point and output. "
             "Is this a log? If so, write its delimiter into a layout and use --layout."
         )
     if form.merge or _is_sparse(columns):

@@ -296,7 +296,12 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
                 low_memory=False,
                 encoding=form.encoding,
             )
-    except (ValueError, OSError, ArithmeticError, MemoryError, pd.errors.ParserWarning) as error:
+    except pd.errors.ParserWarning as error:
+        raise FileFormatError(
+            f"{source}: cannot be read as a table (rows have more cells than the titles: a stray delimiter, or a "
+            "decimal comma?)."
+        ) from error
+    except (ValueError, OSError, ArithmeticError, MemoryError) as error:
         raise FileFormatError(f"{source}: cannot be read as a table ({error_reason(error)}).") from error
 
 

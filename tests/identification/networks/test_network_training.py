@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from softneck.core import DataError
 from softneck.identification import Model, Network
 from softneck.identification.models._drive import fit_correction
 from softneck.identification.networks._network import INTERRUPTED
-from softneck.identification.networks._nn_training import jacobian, levenberg, random_layers
+from softneck.identification.networks._nn_training import axis_data, jacobian, levenberg, random_layers
 from softneck.runtime import load_functions
 
 from ...data import neck_recording, short_neck
@@ -119,3 +120,9 @@ def test_no_free_run_diverges_on_bounded_inputs(models: dict[str, Model]) -> Non
         U[:, :3] = np.repeat(rng.uniform(-6, 6, (30, 3)), 10, axis=0)
         y = block.run(block.initial_state(pitch_start=0.4), U)[1][:, :2]
         assert (np.abs(y) <= bound + 2.0 * (0.4 + bound)).all()
+
+
+def test_runs_shorter_than_the_memory_are_refused_in_one_line() -> None:
+    short = neck_recording(400).rows(0, 30)
+    with pytest.raises(DataError, match=r"a network remembers 30 samples of this robot, and the longest run .* has 30"):
+        axis_data(short, short.set_points, 0, np.array([[0.0, 0.0, 30.0]]), True, None)
