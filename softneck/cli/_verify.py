@@ -155,7 +155,7 @@ def _print(path: Path, found: verification.Verification, folder: Path) -> None:
     table = verification.verdict_table(found)
     print_table(str(path), table.head, table.rows)
     for part in found.evidence.drawn:
-        for row in part.draws.coverage:
+        for row in filter(lambda row: row["motion"] > 0.0, part.draws.coverage):  # files of before have such rows
             click.echo(
                 f"draws cover {100.0 * row['covered']:.0f} % of {row['class']} held-out motions, by a band of "
                 f"+-{100.0 * row['width'] / row['motion']:.0f} % of the motion"

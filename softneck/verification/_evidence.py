@@ -137,8 +137,7 @@ def gather(
             name, draws, controller.block, asked, order=controller.order, observer=observer, attempt=attempt,
             progress=late,
         ))  # fmt: skip
-        slack = any(bound.metric == "sim.slack_s" for bound in asked.bounds)  # of tendons alone
-        if slack and "sim.slack_s" not in evidence.metrics:
+        if _asks_slack(asked) and "sim.slack_s" not in evidence.metrics:
             evidence.not_computed["sim.slack_s"] = (
                 "draws have no tension outputs; verify over FAMILY and a NECK (`softneck.calibrate` in Python makes it)"
             )
@@ -211,7 +210,7 @@ def _add_data_margins(evidence: Evidence) -> None:
     for name, (values, behind) in crossing_values(evidence.crossings).items():
         _add(evidence, name, Values(values, lambda row, behind=behind: crossing_facts(behind[row])))
     if not evidence.crossings:
-        why = "no simulation model was given (a nonlinear MODEL, an FMU, the robot's NECK)"
+        why = "no simulation model was given (a nonlinear MODEL, an FMU or a NECK)"
         evidence.not_computed["margins by experiment"] = why
 
 
@@ -266,6 +265,8 @@ def _fill_metrics(evidence: Evidence, controller: ControllerUnderTest, asked: Re
         values = np.array([run.metrics[name] for run in evidence.necks])
         metrics[f"sim.{asked.scale.name_of(name)}"] = Values(values, describe)
     slack = metrics.pop("sim.slack_s").values
+    if asked.robot.tendon_angles is None and not _asks_slack(asked):
+        return
     known = np.isfinite(slack) | [run.result is None for run in evidence.necks]
     # A heavier payload takes the pretension, whatever the controller does.
     light = [k for k, run in enumerate(evidence.necks) if known[k] and run.payload <= asked.sim["taut_up_to_kg"]]
@@ -276,6 +277,10 @@ def _fill_metrics(evidence: Evidence, controller: ControllerUnderTest, asked: Re
         metrics["sim.slack_s"] = Values(slack[light], lambda row: describe(light[row]))
     else:
         absent["sim.slack_s"] = "all of `payloads_kg` are above `taut_up_to_kg`"
+
+
+def _asks_slack(asked: Requirements) -> bool:
+    return any(bound.metric == "sim.slack_s" for bound in asked.bounds)
 
 
 def _add_linear_margins(evidence: Evidence, part: LinearEvidence) -> None:

@@ -292,7 +292,8 @@ def _spread(found: Verification, group: str, caption: str) -> Table:
 
 def _runs_table(found: Verification) -> Table:
     runs = found.evidence.necks
-    names = list(runs[0].metrics)
+    tendons = found.controller.robot.tendon_angles is not None
+    names = [name for name in runs[0].metrics if tendons or name != "slack_s"]
     rows = [[run.name, *(cell(run.metrics[name]) for name in names)] for run in runs]
     shown = [found.requirements.scale.name_of(f"sim.{name}").partition(".")[2] for name in names]
     return Table("Each loop over a simulation model, in one direction", ["plant, payload, direction", *shown], rows)

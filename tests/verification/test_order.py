@@ -349,7 +349,7 @@ def test_only_an_axis_that_hardly_moves_is_not_judged(monkeypatch: pytest.Monkey
     assert larger["rise_s"] == math.inf
 
 
-def evidence_of(slack: list[tuple[float, float]], monkeypatch: pytest.MonkeyPatch) -> Any:
+def evidence_of(slack: list[tuple[float, float]], monkeypatch: pytest.MonkeyPatch, robot: Robot | None = None) -> Any:
     """Return the evidence of loops with (slack, payload); NaN: no tension outputs, inf: diverged."""
     names = (*AXIS, "max_rad", "limit_violation_s")
     runs = [
@@ -357,7 +357,7 @@ def evidence_of(slack: list[tuple[float, float]], monkeypatch: pytest.MonkeyPatc
                 None if math.isinf(value) else SimpleNamespace())  # pyright: ignore[reportArgumentType]
         for k, (value, kg) in enumerate(slack)
     ]  # fmt: skip
-    asked = make_requirements({"sim": {"taut_up_to_kg": 0.5, "payloads_kg": [0.0, 0.5, 1.0]}})
+    asked = make_requirements({"sim": {"taut_up_to_kg": 0.5, "payloads_kg": [0.0, 0.5, 1.0]}}, robot=robot)
     empty: Any = SimpleNamespace(metrics={}, worse={})
     evidence = Evidence(None, None, [], empty, None, runs)  # pyright: ignore[reportArgumentType]
     controller: Any = SimpleNamespace(why="", block=SimpleNamespace(inputs=()), robot=Robot.preset())
@@ -396,6 +396,15 @@ def test_slack_is_judged_wherever_it_is_known(
         return
     assert found.metrics["sim.slack_s"].values.tolist() == values
     assert found.metrics["sim.slack_s"].describe(len(values) - 1) == {"name": f"run {last}"}
+
+
+def test_a_robot_without_tendons_hears_nothing_of_slack(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Robot.from_dict({
+        "name": "joint", "motors": {"names": ["m"], "unit": "rad"}, "outputs": {"names": ["bend"], "unit": "rad"},
+        "directions": {"kind": "identified"},
+    })  # fmt: skip
+    found = evidence_of([(math.nan, 0.0)], monkeypatch, robot)
+    assert "sim.slack_s" not in {*found.metrics, *found.not_computed}
 
 
 def test_draws_decide_for_what_they_tell_beside_experiments_on_the_user_s_plants() -> None:

@@ -108,6 +108,8 @@ def impossible(plants: tuple[str, ...]) -> dict[str, str]:
 Entry = tuple[float | list[float], int, str]
 # Noise of a channel without noise, relative to its range: a sensor of 1,000 levels.
 _LEAST_NOISE_RATIO = 1e-3
+# Ends of motors' ranges that differ by less of the widest range are one end.
+_ALIKE = 0.1
 
 
 def propose_missing(file: Path, recordings: Sequence[Recording], *, motors: bool) -> list[str]:
@@ -175,8 +177,10 @@ def _add(file: Path, name: str, entries: dict[str, Entry]) -> None:
 def _limits(robot: Robot, recordings: Sequence[Recording]) -> dict[str, Entry]:
     """Return the range and the rate of the motors in the recordings, in the robot's unit."""
     unit = to_si(robot.motors.unit)[0]
-    lowest = min(float(recording.set_points.min()) for recording in recordings) / unit
-    highest = max(float(recording.set_points.max()) for recording in recordings) / unit
+    set_points = np.concatenate([recording.set_points for recording in recordings]) / unit
+    lowest, highest = set_points.min(axis=0), set_points.max(axis=0)
+    # Motors that were recorded in one range have it; a weaker one is not sent where it has never been.
+    alike = np.ptp([lowest, highest], axis=1).max() <= _ALIKE * np.ptp([lowest, highest])
     rates = []
     for recording in recordings:
         moved = recording.motor_positions if recording.has_motor_positions else recording.set_points
@@ -186,8 +190,8 @@ def _limits(robot: Robot, recordings: Sequence[Recording]) -> dict[str, Entry]:
     how = "fastest measured move" if measured else "largest step of a set-point in a sample"
     range_why = "range of the set-points in the recordings"
     return {
-        "setpoint_min": (_digits(lowest), 70, range_why),
-        "setpoint_max": (_digits(highest), 70, range_why),
+        "setpoint_min": (_digits(lowest.min()) if alike else [*map(_digits, lowest)], 70, range_why),
+        "setpoint_max": (_digits(highest.max()) if alike else [*map(_digits, highest)], 70, range_why),
         "rate_limit": (_digits(max(rates) / unit), 50, f"{how} in the recordings"),
     }
 

@@ -117,3 +117,15 @@ def test_a_robot_whose_set_points_are_of_one_sign_is_tried_at_the_mean_of_its_re
     # Three digits are written.
     assert robot.motors.rest == pytest.approx((pressed.set_points.mean() / unit,), rel=5e-3)
     assert robot.outputs.rest == pytest.approx((pressed.outputs.mean() / 1e-3,), rel=5e-3)
+
+
+@pytest.mark.parametrize(("second", "least", "most"), [(1.05, 0.0, 105.0), (1.5, [0.0, 0.0], [100.0, 150.0])])
+def test_each_motor_has_the_range_that_it_was_recorded_in(second: float, least: object, most: object) -> None:
+    """One range where they differ by less than a tenth of it: a chamber of 1 bar is not sent to 1.5 bar."""
+    robot = Robot.from_dict({
+        "name": "arm", "motors": {"names": ["a", "b"], "unit": "kPa"}, "outputs": {"names": ["x"], "unit": "mm"},
+        "directions": {"kind": "identified"},
+    })  # fmt: skip
+    u = np.linspace(0.0, 1e5, 200)[:, None] * [1.0, second]
+    limits = _possible._limits(robot, [Recording.from_arrays(u, u[:, :1], sample_time=0.02, robot=robot)])
+    assert (limits["setpoint_min"][0], limits["setpoint_max"][0]) == (least, most)
