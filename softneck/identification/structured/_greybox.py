@@ -52,8 +52,9 @@ class GreyBox:
         sensor_delay: dead time of the inclinometer in samples; None tries 1 to 4, of a slower robot as
             many more.
         body: what it has beside these numbers: nothing ("rigid"), some of anisotropy, stop (of compression),
-            softening, creep and tendons (their angles and arms) joined by "+", "all", or ("auto") those that predict
-            motions left out of a training better.
+            softening, creep, tendons (their angles and arms), homing (where they are stretched alike), arc (how a bend
+            gives them way) and speed (of the drives) joined by "+", "all", or ("auto") those that predict motions left
+            out of a training better.
     """
 
     evaluations: int = 40

@@ -2,15 +2,16 @@
 
 Lengths of tendon are in radians of motor, tensions in radians of stretch, so that no stiffness appears twice.
 
-- drive: m_j lags its delayed set-point, and stops where its tension reaches `pull_limit`;
-- stretch: x_j = pretension + m_j - lever (e_j . b) - s, tension T_j = max(0, x_j): a tendon only pulls;
-- bend: b' = gain sum T_j e_j - stiffness F (1 +- asymmetry) (b - rest) - stiffening |b|^2 b - friction z
-  - stiffness creep (b - r) - F stiffness a(b);
+- drive: m_j lags its delayed set-point, not faster than `top_speed`, and stops where its tension reaches `pull_limit`;
+- stretch: x_j = pretension + m_j - lever (e_j . (b - home)) - arc |b|^2 - s, tension T_j = max(0, x_j): a tendon only
+  pulls, and the plates that a bent link carries are nearer to each other (of an arc of length L by L |b|^2 / 24);
+- bend: b' = gain sum T_j (e_j + 2 arc / lever b) - stiffness F (1 +- asymmetry) (b - rest) - stiffening |b|^2 b
+  - friction z - stiffness (creep (b - r) + slow_creep (b - q)) - F stiffness a(b);
 - softening: F = (1 - lasting (1 - exp(-2 B / reach))) (1 + a / 2) / (1 + a |b| / reach), B the largest bend of late,
   forgotten over 300 time constants (Mullins 1969, Rubber Chem. Technol. 42:339), a the softening;
 - anisotropy: a = coupling (b_2 - rest_2, b_1 - rest_1) + (l_1 q - l_2 p, -l_1 p - l_2 q), where
   q = 2 (b_1^2 - b_2^2) / (reach + |b|) and p = 4 b_1 b_2 / (reach + |b|): three lobes, of bounded slope;
-- creep (a Maxwell branch): r' = creep_rate (b - r);
+- creep (two Maxwell branches): r' = creep_rate (b - r), q' = slow_creep_rate (b - q);
 - compression: s' = axial_rate (compliance (sum (T_j - pretension)) - s - 9 max(0, s - 1 / stop));
 - hysteresis (Dahl): z' = b' - |b'| z / friction_angle, so |z| <= friction_angle;
 - tilt: pitch = atan2(sin|b| b_1/|b|, cos|b|), roll likewise, through a dead time and a first-order lag.
@@ -57,8 +58,8 @@ NECK_SIZE = 16
 # the sines of the tendons' angles; with one output the sines are zero.
 NECK_SHARE = 16
 NECK_TENDONS = 17
-NECK_STATES = 10
-# Numbers of `body`: what a body of foam or of coils does beside.
+NECK_STATES = 12
+# Numbers of `body`: what a body of foam or of coils does beside, and tendons and drives.
 BODY_REACH = 0
 BODY_SOFTENING = 1
 BODY_LASTING = 2
@@ -67,6 +68,11 @@ BODY_CREEP_RATE = 4
 BODY_COUPLING = 5
 BODY_LOBES = 6  # two
 BODY_STOP = 8
+BODY_ARC = 9
+BODY_HOME = 10  # two
+BODY_SLOW_CREEP = 12
+BODY_SLOW_CREEP_RATE = 13
+BODY_TOP_SPEED = 14
 # The largest bend of late is forgotten over 60 s of a neck's time, 300 time constants.
 _FORGET_RATE = 1.0 / 60.0
 # A stalled drive gives way as the bend does: 4 ms at 20 ms follow that closely enough.
@@ -83,6 +89,7 @@ class NeckState(StateVector):
     sensor = cells("2", "what the sensor says [rad]")
     r = cells("2", "bend that has crept [rad]")
     largest = cells("", "largest bend of late [rad]")
+    q = cells("2", "bend that has crept slowly [rad]")
     tilts = rest("the dead time's line: tilts of pitch, newest first, then those of roll [rad]")
 
 
@@ -120,30 +127,38 @@ def neck_advance(
     whole = neck[NECK_STIFFNESS] * (1.0 + 0.5 * body[BODY_SOFTENING])
     whole *= 1.0 - body[BODY_LASTING] * (1.0 - math.exp(-2.0 * x.largest / body[BODY_REACH]))
     creep = neck[NECK_STIFFNESS] * body[BODY_CREEP]
+    slow_creep = neck[NECK_STIFFNESS] * body[BODY_SLOW_CREEP]
     softening = body[BODY_SOFTENING] / body[BODY_REACH]
     coupling = body[BODY_COUPLING]
     lobe0 = body[BODY_LOBES]
     lobe1 = body[BODY_LOBES + 1]
     # The largest slope that these add, as a part of the stiffness.
     skew = abs(coupling) + 4.0 * (abs(lobe0) + abs(lobe1))
+    most = dt * body[BODY_TOP_SPEED]
+    arc = body[BODY_ARC]
+    arm = 2.0 * arc / neck[NECK_LEVER]
     size = math.sqrt(x.b[0] * x.b[0] + x.b[1] * x.b[1])
     for _ in range(_SUBSTEPS):
         pull0 = 0.0
         pull1 = 0.0
         total = 0.0
         taut = 0
+        squared = x.b[0] * x.b[0] + x.b[1] * x.b[1]
+        nearer = arc * squared + x.s
         for j in range(m.shape[0]):
-            toward = e[0, j] * x.b[0] + e[1, j] * x.b[1]
+            toward = e[0, j] * (x.b[0] - body[BODY_HOME]) + e[1, j] * (x.b[1] - body[BODY_HOME + 1])
             # x_j = pull_limit, solved for m_j. Where the neck moves away a stalled drive gives way: below m.
-            limit = neck[NECK_PULL_LIMIT] - neck[NECK_PRETENSION] + neck[NECK_LEVER] * toward + x.s
-            m[j] = min(keep * m[j] + (1.0 - keep) * targets[j], limit)
-            stretch = neck[NECK_PRETENSION] + m[j] - neck[NECK_LEVER] * toward - x.s
+            limit = neck[NECK_PULL_LIMIT] - neck[NECK_PRETENSION] + neck[NECK_LEVER] * toward + nearer
+            lagging = keep * m[j] + (1.0 - keep) * targets[j]
+            m[j] = min(min(max(lagging, m[j] - most), m[j] + most), limit)
+            stretch = neck[NECK_PRETENSION] + m[j] - neck[NECK_LEVER] * toward - nearer
             if stretch > 0.0:  # a slack tendon neither pulls nor adds to `rate`
                 pull0 += stretch * e[0, j]
                 pull1 += stretch * e[1, j]
                 total += stretch
                 taut += 1
-        squared = x.b[0] * x.b[0] + x.b[1] * x.b[1]
+        pull0 += total * arm * x.b[0]
+        pull1 += total * arm * x.b[1]
         loss = neck[NECK_STIFFENING] * squared
         stiffness = whole / (1.0 + softening * size)
         k0 = stiffness * (1.0 + neck[NECK_ASYMMETRY])
@@ -152,8 +167,8 @@ def neck_advance(
         f1 = (
             neck[NECK_GAIN] * pull1 - k1 * (x.b[1] - neck[NECK_REST + 1]) - loss * x.b[1] - neck[NECK_FRICTION] * x.z[1]
         )
-        f0 -= creep * (x.b[0] - x.r[0])
-        f1 -= creep * (x.b[1] - x.r[1])
+        f0 -= creep * (x.b[0] - x.r[0]) + slow_creep * (x.b[0] - x.q[0])
+        f1 -= creep * (x.b[1] - x.r[1]) + slow_creep * (x.b[1] - x.q[1])
         # Three lobes make it stiffer each 120 deg; divided, so that their slope stays bounded at large bends.
         q = 2.0 * (x.b[0] * x.b[0] - x.b[1] * x.b[1]) / (body[BODY_REACH] + size)
         p = 4.0 * x.b[0] * x.b[1] / (body[BODY_REACH] + size)
@@ -162,7 +177,9 @@ def neck_advance(
         # Minus the slope of f over b, one number for both directions: the cube's at its steepest, and half of each taut
         # tendon, as e e' of all three add up to 3/2.
         rate = stiffness + 3.0 * loss + share * taut * neck[NECK_GAIN] * neck[NECK_LEVER] + neck[NECK_FRICTION] + creep
-        rate += skew * stiffness
+        rate += skew * stiffness + slow_creep
+        # An arc lengthens each tendon's arm.
+        rate += share * taut * neck[NECK_GAIN] * neck[NECK_LEVER] * arm * size * (2.0 + arm * size)
         d0 = dt * f0 / (1.0 + dt * rate)  # one stage: (1 + dt rate) d = dt f
         d1 = dt * f1 / (1.0 + dt * rate)
         x.b[0] += d0
@@ -188,6 +205,9 @@ def neck_advance(
     part = 1.0 - math.exp(-body[BODY_CREEP_RATE] * sample_time)
     x.r[0] += part * (x.b[0] - x.r[0])
     x.r[1] += part * (x.b[1] - x.r[1])
+    part = 1.0 - math.exp(-body[BODY_SLOW_CREEP_RATE] * sample_time)
+    x.q[0] += part * (x.b[0] - x.q[0])
+    x.q[1] += part * (x.b[1] - x.q[1])
     x.largest = max(size, x.largest * math.exp(-_FORGET_RATE * sample_time))
 
 
@@ -195,6 +215,8 @@ def neck_crept(x: NeckState) -> None:
     """Let the body creep to where it is, as it does at rest."""
     x.r[0] = x.b[0]
     x.r[1] = x.b[1]
+    x.q[0] = x.b[0]
+    x.q[1] = x.b[1]
 
 
 def neck_sense(neck: np.ndarray, sample_time: float, x: NeckState) -> None:
@@ -264,7 +286,7 @@ class GreyBoxArrays(NarxArrays):
     """The parameters of the equations and the arrays around them."""
 
     neck = array("numbers", "of the equations, in the order of NECK_*; of another robot its tendons behind them")
-    body = array("9", "reach [rad], softening, creep, anisotropy, stop; see BODY_*")
+    body = array("15", "reach [rad], softening, creep, anisotropy, stop, arc, home, top speed; see BODY_*")
     sensor = array("2", "dead time [samples], and sample time in the time of a neck [s]")
     echo = array("outputs, p", "of what was measured above the equations, newest first")
     memory = array("1", "samples after which a held start has settled")
@@ -275,7 +297,7 @@ class GreyBoxState(NarxState):
     """Histories, then the state of the equations (see `NeckState`)."""
 
     neck = cells(
-        "10 + 2 * dead", "bend, hysteresis, compression, sensor, creep, largest bend, and the dead time's line of tilts"
+        "12 + 2 * dead", "bend, hysteresis, compression, sensor, creep, largest bend, and the dead time's line of tilts"
     )
 
 

@@ -116,6 +116,16 @@ class FitProblem:
         """Return the problem with the numbers of optional parts."""
         return replace(self, numbers=(*self.numbers, *(number for part in parts for number in PARTS[part])))
 
+    def guess(self, number: Parameter) -> float:
+        """Return where the search begins: of `top_speed` at the largest one recorded, where set-points are faster."""
+        if number.name != "top_speed" or not self.logged:
+            return number.guess
+        asked, moved = (
+            max(np.nanmax(np.abs(P[2:] - P[:-2]), initial=0.0) for P in positions) / (2.0 * self.sample_time)
+            for positions in zip(*((u, m) for u, _, m, _ in self.runs), strict=True)
+        )
+        return float(np.clip(moved, number.low, number.high)) if asked > 2.0 * moved else number.guess
+
     def as_sure_as(self, x: Vector, delay: float) -> FitProblem:
         """Return the problem with the prior that the error at `x` gives: of one independent row (Bayes)."""
         misses = self.misses(x, delay)

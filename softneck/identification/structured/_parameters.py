@@ -27,7 +27,7 @@ class Parameter:
     @property
     def is_rate(self) -> bool:
         """Whether it is by the second."""
-        return self.unit in ("1/s", "1/(rad s)", "1/(rad^2 s)", "1/(s kg)")
+        return self.unit in ("1/s", "rad/s", "1/(rad s)", "1/(rad^2 s)", "1/(s kg)")
 
     def encode(self, value: float) -> float:
         """Return the search variable of a value."""
@@ -77,6 +77,8 @@ def payload_parameters(payloads: int) -> tuple[Parameter, ...]:
     return PAYLOAD_PARAMETERS if payloads == _STRAIGHT_PAYLOADS else (*PAYLOAD_PARAMETERS, PAYLOAD_CURVE)
 
 
+# A speed that no drive reaches [rad/s].
+FASTEST = 1e4
 # What a body of foam or coils does beside, each part on its own; zero is a body of constant stiffness without creep.
 SOFTENING_PARAMETERS = (
     Parameter("softening", "1", 0.05, 0.0, 20.0, 3.0, False, "stiffness at rest over that at the reach, less one"),
@@ -85,6 +87,8 @@ SOFTENING_PARAMETERS = (
 CREEP_PARAMETERS = (
     Parameter("creep", "1", 0.05, 0.0, 3.0, 0.5, False, "stiffness that creeps away over the stiffness that stays"),
     Parameter("creep_rate", "1/s", 1.0, 0.01, 10.0, 1.0, True, "rate of creep"),
+    Parameter("slow_creep", "1", 0.05, 0.0, 3.0, 0.5, False, "stiffness that creeps away slowly over what stays"),
+    Parameter("slow_creep_rate", "1/s", 0.2, 0.005, 10.0, 1.0, True, "rate of slow creep"),
 )
 # Where the tendons are: those of 2 and 3 against tendon 1, which `twist` and `lever` move.
 TENDON_PARAMETERS = (
@@ -92,6 +96,11 @@ TENDON_PARAMETERS = (
     Parameter("angle_3", "rad", 0.0, -0.5, 0.5, 0.1, False, "place of tendon 3 past its nominal angle"),
     Parameter("arm_2", "1", 1.0, 0.5, 2.0, 0.1, True, "arm of tendon 2 over that of tendon 1"),
     Parameter("arm_3", "1", 1.0, 0.5, 2.0, 0.1, True, "arm of tendon 3 over that of tendon 1"),
+)
+# Homed to one tension, tendons that are displaced bend the link.
+HOME_PARAMETERS = (
+    Parameter("home_pitch", "rad", 0.0, -0.3, 0.3, 0.05, False, "bend at which all tendons are stretched alike"),
+    Parameter("home_roll", "rad", 0.0, -0.3, 0.3, 0.05, False, "bend at which all tendons are stretched alike"),
 )
 # Where it is stiffer: between the axes, as a spring's main directions may lie, and towards three lobes.
 ANISOTROPY_PARAMETERS = (
@@ -103,17 +112,28 @@ ANISOTROPY_PARAMETERS = (
 STOP_PARAMETERS = (
     Parameter("stop", "1/rad", 1.4, 0.0, 20.0, 5.0, False, "one over the compression at which the link gets stiff"),
 )
+# A bent link brings its plates nearer to each other: of an arc L / (24 r), of a straight line between plates L / (6 r).
+ARC_PARAMETERS = (
+    Parameter("arc", "rad/rad^2", 0.5, 0.0, 20.0, 1.0, False, "what the square of a bend takes off each tendon's way"),
+)
+SPEED_PARAMETERS = (Parameter("top_speed", "rad/s", 20.0, 0.5, FASTEST, 1.0, True, "largest speed of the drives"),)
 PARTS = {
     "anisotropy": ANISOTROPY_PARAMETERS,
     "stop": STOP_PARAMETERS,
     "softening": SOFTENING_PARAMETERS,
     "creep": CREEP_PARAMETERS,
     "tendons": TENDON_PARAMETERS,
+    "homing": HOME_PARAMETERS,
+    "arc": ARC_PARAMETERS,
+    "speed": SPEED_PARAMETERS,
 }
 # In the order of BODY_*, behind the reach.
-BODY_PARAMETERS = (*SOFTENING_PARAMETERS, *CREEP_PARAMETERS, *ANISOTROPY_PARAMETERS, *STOP_PARAMETERS)
-# A body of constant stiffness without creep.
-RIGID = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+BODY_PARAMETERS = (
+    *SOFTENING_PARAMETERS, *CREEP_PARAMETERS[:2], *ANISOTROPY_PARAMETERS, *STOP_PARAMETERS, *ARC_PARAMETERS,
+    *HOME_PARAMETERS, *CREEP_PARAMETERS[2:], *SPEED_PARAMETERS,
+)  # fmt: skip
+# A body of constant stiffness without creep, behind drives of any speed.
+RIGID = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, FASTEST])
 
 # Those that have no meaning where the link bends in one plane.
 OUT_OF_PLANE_PARAMETERS = ("asymmetry", "rest_roll", "twist")

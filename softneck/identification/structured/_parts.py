@@ -1,4 +1,4 @@
-"""The optional parts of the grey box: anisotropy, stop, softening, creep, displaced tendons."""
+"""The optional parts of the grey box: which a robot can have, which its data confirm, and what they say in words."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ from ..models._scores import nrmse_fit
 from ._output_error import FitProblem, Found, SearchProgress
 from ._parameters import PARTS
 
-GEOMETRY = "tendons"  # shows in every motion
 # Steps of a search on a part of the rows, from what was found on all.
 _STEPS = 4
+# Steps of the search on all rows from there: later ones moved no test's fit by more than 0.1 points (six necks).
+_LAST_STEPS = 12
+GEOMETRY = "tendons"  # shows in every motion
 # What a part must gain [points]: seeds of the noise move fits by as much. With one motion what was left out resembles
-# the rest: laws of amplitude and time must also gain this share of what is missing to 100 %.
-_LEAST_GAIN, _LEAST_SHARE = 0.5, 0.15
+# the rest: other parts must also gain this share of what is missing to 100 %.
+_LEAST_GAIN, _LEAST_SHARE = 0.5, 0.2
 # Parts that were searched at once are dropped again where taking them out costs no more [points].
 _HARDLY = 0.1
 
@@ -46,13 +48,14 @@ def extend(found: Found, parts: Sequence[str], evaluations: int, tell: SearchPro
     larger = found.problem.as_sure_as(found.x, found.delay).with_parts(*able)
     new = larger.numbers[len(found.x) :]
     tell.what = "parts"
-    x = np.concatenate([found.x, [number.encode(number.guess) for number in new]])
+    x = np.concatenate([found.x, [number.encode(larger.guess(number)) for number in new]])
     return larger.search(x, found.delay, evaluations, tell)
 
 
 def _able(problem: FitProblem) -> list[str]:
-    """Return the parts that a robot can have: no tendons of other robots, no anisotropy in a plane."""
-    can = {GEOMETRY: problem.has_neck_tendons, "anisotropy": problem.has_two_outputs}
+    """Return the parts that a robot can have: no tendons of other robots; in a plane no anisotropy or homing."""
+    spatial = problem.has_two_outputs
+    can = {GEOMETRY: problem.has_neck_tendons, "anisotropy": spatial, "homing": spatial}
     return [part for part in PARTS if can.get(part, True)]
 
 
@@ -123,7 +126,7 @@ def choose_parts(
     larger = found.problem.as_sure_as(found.x, found.delay).with_parts(*chosen)
     # A simulation that diverged has no number.
     said: dict[str, object] = {"parts": {part: max(fit, 0.0) for part, fit in kept.items()}}
-    return larger.search(trials[0].found.x, found.delay, evaluations, tell), said
+    return larger.search(trials[0].found.x, found.delay, min(evaluations, _LAST_STEPS), tell), said
 
 
 def _extended(
@@ -188,11 +191,21 @@ def describe_parts(problem: FitProblem, x: Vector, second: float) -> str:
             f"and by {100.0 * found['lasting_softening'] * (1.0 - np.exp(-2.0)):.0f} % after a bend of {reach:.0f} deg"
         )
     if "creep" in found:
-        share = found["creep"] / (1.0 + found["creep"])
-        seconds = second / found["creep_rate"]
-        parts.append(f"{100.0 * share:.0f} % of the stiffness creeps away with a time constant of {seconds:.2g} s")
+        for creep in ("creep", "slow_creep"):
+            share = found[creep] / (1.0 + found["creep"] + found["slow_creep"])
+            seconds = second / found[f"{creep}_rate"]
+            parts.append(f"{100.0 * share:.0f} % of the stiffness creeps away with a time constant of {seconds:.2g} s")
     if "angle_2" in found:
         for j, nominal in ((2, 120.0), (3, 240.0)):
             angle = nominal + np.degrees(found[f"angle_{j}"])
             parts.append(f"tendon {j} stands at {angle:.0f} deg with {found[f'arm_{j}']:.2f} of the arm of tendon 1")
+    if "home_pitch" in found:
+        pitch, roll = np.degrees([found["home_pitch"], found["home_roll"]])
+        parts.append(f"tendons are stretched alike at {pitch:.1f} deg of pitch and {roll:.1f} deg of roll")
+    if "arc" in found:
+        parts.append(
+            f"a bend of {reach:.0f} deg takes {found['arc'] * problem.reach**2:.2g} rad of motor off each tendon"
+        )
+    if "top_speed" in found:
+        parts.append(f"drives turn at up to {found['top_speed'] / second:.2g} rad/s")
     return "; ".join(parts)

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.core import FileFormatError, SettingsError, load
+from softneck.core import FileFormatError, SettingsError, load, silent
 from softneck.identification import GreyBox, Model
 from softneck.identification.models._fitting import ScaledData
-from softneck.identification.models._left_out import Judged
+from softneck.identification.models._left_out import Fold, Judged
 from softneck.identification.structured._greybox import PARAMETERS
-from softneck.identification.structured._output_error import FitProblem, Found
-from softneck.identification.structured._parameters import BODY_PARAMETERS, RIGID
-from softneck.identification.structured._parts import _Trial
+from softneck.identification.structured._output_error import FitProblem, Found, SearchProgress
+from softneck.identification.structured._parameters import BODY_PARAMETERS, PARTS, RIGID
+from softneck.identification.structured._parts import _Trial, _trial
 from softneck.runtime import load_functions
 from softneck.signals import SET_POINTS, Recording, signal
 from softneck.signals.recording._channels import MOTOR_POSITIONS
@@ -131,6 +131,98 @@ def test_a_link_at_its_stop_is_compressed_a_tenth_as_far() -> None:
     # A stiffer link stretches the tendons more: its drives stall earlier.
     assert (stopped < free - 0.1).all()
     np.testing.assert_array_equal(run(body(stop=1e-9), U)[0], run(RIGID, U)[0])
+
+
+def index(name: str) -> int:
+    return [number.name for number in PARAMETERS].index(name)
+
+
+def test_two_branches_of_half_the_stiffness_creep_as_one() -> None:
+    halves = body(creep=0.4, creep_rate=0.7, slow_creep=0.4, slow_creep_rate=0.7)
+    U = held(1.5, 200)
+    # The same sums in another order: rounding.
+    np.testing.assert_allclose(run(halves, U)[1], run(body(creep=0.8, creep_rate=0.7), U)[1], atol=1e-12)
+
+
+def test_drives_turn_at_their_top_speed_until_they_are_near() -> None:
+    M, _ = run(body(top_speed=2.0), held(0.55, 100))
+    speed = np.diff(M[:, 0]) / TS
+    # The lag's 10 1/s alone would be faster down to 0.2 rad; sums of substeps round.
+    far = 0.55 - M[:-1, 0] > 0.25
+    np.testing.assert_allclose(speed[13:][far[13:]], 2.0, rtol=1e-9)
+    assert far[13:].sum() >= 5
+    assert M[-1, 0] == pytest.approx(0.55, abs=1e-3)
+    np.testing.assert_array_equal(run(body(top_speed=1e3), held(0.55, 60))[0], run(RIGID, held(0.55, 60))[0])
+
+
+def test_a_neck_at_home_where_it_rests_moves_as_one_that_rests_straight() -> None:
+    numbers = GUESS.copy()
+    # A cube of the bend and friction know where it is straight, or where it was.
+    numbers[[index("stiffening"), index("friction")]] = 0.0
+    leaning = numbers.copy()
+    leaning[index("rest_pitch")] = 0.05
+    U = held(1.0, 400)
+    # In the plane of pitch the tilt is the bend. 8 s are far beyond its time constants.
+    assert run(body(home_pitch=0.05), U, leaning)[1][-1, 0] == pytest.approx(run(RIGID, U, numbers)[1][-1, 0] + 0.05)
+    assert abs(run(RIGID, U, leaning)[1][-1, 0] - run(RIGID, U, numbers)[1][-1, 0] - 0.05) > 0.01
+
+
+def test_an_arc_rests_where_link_and_tendons_hold_the_least_energy() -> None:
+    numbers = GUESS.copy()
+    numbers[[index("friction"), index("compliance")]] = 0.0
+    pretension, lever, gain, stiffness, stiffening = (
+        numbers[index(name)] for name in ("pretension", "lever", "gain", "stiffness", "stiffening")
+    )
+    m = run(body(arc=2.0), held(1.0, 400), numbers)[0][-1]
+    b = np.linspace(0.0, 0.5, 50_001)
+    stretch = pretension + m[:, None] - lever * np.outer([1.0, -0.5, -0.5], b) - 2.0 * b**2
+    energy = 0.5 * stiffness * b**2 + 0.25 * stiffening * b**4
+    energy += gain / lever * 0.5 * (np.maximum(0.0, stretch) ** 2).sum(axis=0)
+    # The grid's step is 1e-5 rad.
+    found = run(body(arc=2.0), held(1.0, 400), numbers)[1][-1, 0]
+    assert found == pytest.approx(b[np.argmin(energy)], abs=2e-5)
+    assert abs(found - run(RIGID, held(1.0, 400), numbers)[1][-1, 0]) > 0.005
+
+
+def test_the_search_for_the_top_speed_begins_at_the_recorded_one() -> None:
+    U = np.zeros((400, 3))
+    U[50:, 0], U[200:, 1] = 0.5, 0.5
+    slow = body(top_speed=2.0)
+    M, Y = run(slow, U)
+    channels = dict(zip((*SET_POINTS, *MOTOR_POSITIONS, "pitch", "roll"), (*U.T, *M.T, *Y.T), strict=True))
+    data = Recording(np.arange(len(U)) * TS, TS, channels)
+    problem = FitProblem.of(ScaledData.of(data, amplitudes=False))
+    (speed,) = PARTS["speed"]
+    # The drives get that fast; sums of substeps round.
+    assert problem.guess(speed) == pytest.approx(2.0, rel=1e-9)
+    # Set-points that the drives keep up with do not tell it.
+    U = np.outer(0.5 * np.sin(0.04 * np.arange(400)), [1.0, -0.5, -0.5])
+    M, Y = run(slow, U)
+    channels = dict(zip((*SET_POINTS, *MOTOR_POSITIONS, "pitch", "roll"), (*U.T, *M.T, *Y.T), strict=True))
+    smooth = FitProblem.of(ScaledData.of(replace(data, channels=channels), amplitudes=False))
+    assert replace(smooth, logged=False).guess(speed) == smooth.guess(speed) == speed.guess
+    assert problem.guess(PARAMETERS[0]) == PARAMETERS[0].guess
+
+
+def test_trials_have_the_drives_of_the_whole() -> None:
+    data = recording(RIGID, "eq22", 1, 400)
+    scaled = ScaledData.of(data, amplitudes=False)
+    whole = FitProblem.of(scaled)
+    whole = replace(whole, drive_delays=whole.drive_delays + 2.0)  # as other rows might say
+    x = np.array([number.encode(number.guess) for number in whole.numbers])
+    fold = Fold(data, (Judged("part", data, np.ones(len(data), dtype=bool)),))
+    trial = _trial(Found(whole, x, 2, 1.0), scaled, fold, 1, SearchProgress(silent, 1))
+    for problem in (trial.found.problem, trial.judged[0][1]):
+        np.testing.assert_array_equal(problem.drive_delays, whole.drive_delays)
+
+
+def test_a_file_of_nine_numbers_of_the_body_is_one_without_the_later_parts(tmp_path: Path) -> None:
+    model = GreyBox(sensor_delay=2, evaluations=1, body="creep").fit(recording(CREEP, "mixed", 1, 300))
+    replace(model, arrays={**model.arrays, "body": body(creep=0.5)}).save(tmp_path / "new.npz")
+    replace(model, arrays={**model.arrays, "body": body(creep=0.5)[:9]}).save(tmp_path / "old.npz")
+    test = recording(CREEP, "sine", 3, 100)
+    new, old = (load(tmp_path / f"{name}.npz").simulate(test) for name in ("new", "old"))
+    np.testing.assert_array_equal(old, new)
 
 
 @pytest.fixture(scope="module")
