@@ -208,7 +208,7 @@ def test_hostile_files_and_states_break_nothing_under_the_sanitizers(sensitiviti
 
 def test_a_kind_that_is_not_in_the_library_is_named(tmp_path: Path) -> None:
     block = dataclasses.replace(block_of("rls"), runtime="softneck.runtime._random_runtime")
-    with pytest.raises(SettingsError, match=r"`softneck.runtime._random_runtime` cannot be in a compiled FMU"):
+    with pytest.raises(SettingsError, match=r"`random` cannot be in a compiled FMU"):
         build_compiled_fmu(block, tmp_path / "X.fmu")
     flat = dataclasses.replace(block_of("rls"), arrays=tuple(array.ravel() for array in block_of("rls").arrays))
     with pytest.raises(SettingsError, match="has arrays of ranks"):

@@ -56,6 +56,19 @@ def test_an_output_beyond_its_range_is_reported_once_and_not_valid(path: Path, l
         assert said[0].endswith("output pitch = 0.03 is outside -3.14159 to 0.02 rad: the model is not valid there.")
 
 
+@pytest.mark.parametrize("build", [build_fmu, build_compiled_fmu])
+@pytest.mark.parametrize(("role", "reports"), [("plant", 1), ("controller", 0)])
+def test_what_a_controller_shows_before_its_first_step_is_no_decision(
+    build: Callable[..., Any], role: str, reports: int, tmp_path: Path, running: Any
+) -> None:
+    """Chambers that are never below 0.3 kPa: set-points rest at zero before, and nothing is said of it."""
+    outputs = [replace(port, minimum=0.01) if port.name == "pitch" else port for port in line().outputs]
+    build(replace(line(), role=role, outputs=tuple(outputs)), tmp_path / "Part.fmu")
+    with running(tmp_path / "Part.fmu") as fmu:
+        fmu.begin()
+        assert len([text for _, text in fmu.log if "output pitch = 0 is outside" in text]) == reports
+
+
 def test_a_seed_is_an_integer_of_both_backends(path: Path, running: Any) -> None:
     with running(path) as fmu:
         assert "noise_seed" in fmu.integers

@@ -53,10 +53,8 @@ def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
         )
     runs = module_of(outer)
     if not is_known(runs):
-        raise SettingsError(
-            f"`{outer}` cannot be in a compiled FMU: it is not in the table of softneck.fmu.compiled; "
-            "use `--backend python`."
-        )
+        kind = outer.rpartition(".")[2].partition("@")[0].strip("_").removesuffix("_runtime")
+        raise SettingsError(f"`{kind}` cannot be in a compiled FMU; use `--backend python`.")
     own = len(arrays) - sum(int(count) for _, _, count in pairs)
     ranks = tuple(array.ndim for array in arrays[: max(own, 0)])
     if ranks != ranks_of(runs):

@@ -279,7 +279,8 @@ static int sn_initialise(sn_instance *s)
     if (!s->stale)
         return 1;
     memset(s->state.p, 0, (size_t)s->state.n * sizeof(double));
-    if (!sn_worked(s, SN_INITIALISE) || !sn_check_outputs(s))
+    /* A controller decides in its first step; set-points rest at zero before, allowed or not. */
+    if (!sn_worked(s, SN_INITIALISE) || (s->model.plant && !sn_check_outputs(s)))
         return 0;
     memcpy(s->outputs.p, s->pending.p, (size_t)s->pending.n * sizeof(double));
     s->stale = 0;
