@@ -70,6 +70,18 @@ def test_a_step_into_the_void_is_shortened() -> None:
     assert w[0] == pytest.approx(np.exp(3.0), rel=1e-6)
 
 
+def test_steps_in_single_precision_end_where_the_slope_is_zero_in_double() -> None:
+    rng = np.random.default_rng(3)
+    J, target, decay = rng.standard_normal((60, 20)), 7.0 * rng.standard_normal(60), 0.03
+
+    def errors(w: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        return target - J @ w, J if derivatives else None
+
+    w = levenberg(errors, np.zeros(20), iterations=60, decay=decay, on_step=lambda _w, _c: True)
+    # A step leaves about 1e-7 of the distance, until the cost no longer falls in double precision, which is its square.
+    np.testing.assert_allclose(J.T @ (target - J @ w), decay * w, rtol=0, atol=1e-9)
+
+
 def test_the_correction_learns_a_bias_and_leaves_white_noise_alone() -> None:
     rng = np.random.default_rng(0)
     white = rng.standard_normal(5000)
