@@ -86,14 +86,14 @@ def group() -> None:
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 # Compiling makes millions of objects that stay: to look for unused ones after each 700, as Python does, took 8 % of its
 # time. With these 5 MB more are in use.
-_GARBAGE_THRESHOLDS = (50_000, 20, 50)
+GARBAGE_THRESHOLDS = (50_000, 20, 50)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
     for name in _BLAS_THREADS:  # read where numpy is imported, which no command has done yet
         os.environ.setdefault(name, "1")
-    gc.set_threshold(*_GARBAGE_THRESHOLDS)
+    gc.set_threshold(*GARBAGE_THRESHOLDS)
     code = run(arguments)
     atexit.register(_ignore_signals)
     sys.exit(code)

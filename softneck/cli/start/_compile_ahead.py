@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
 import sys
@@ -15,6 +16,7 @@ from softneck.core import load
 from softneck.robot import Robot
 from softneck.runtime import cache_folder
 
+from .._main import GARBAGE_THRESHOLDS
 from ._plan import AUTO, FAMILY, PI, linear_model
 
 
@@ -22,11 +24,12 @@ def compile_ahead(*recordings: str) -> None:
     """Compile what the steps after the models call, in a process that no step waits for, with the lowest priority.
 
     Run are an observer and the loops of one controller, over the model of the draws and over the best model if that is
-    nonlinear, when they are there; the steps then load the functions from the cache.
+    nonlinear, when they are there, and the predictions of the report; the steps then load the functions from the cache.
     """
     from softneck import estimation, signals, tuning
 
     getattr(os, "nice", int)(19)
+    gc.set_threshold(*GARBAGE_THRESHOLDS)
     family = _await(FAMILY)
     observer = estimation.KalmanSettings().design(family)
     fitted = estimation.fit_observer(observer, [signals.read_recording(name) for name in recordings], set())
@@ -40,6 +43,10 @@ def compile_ahead(*recordings: str) -> None:
         task = tuning.task_of([bare, model or load(AUTO)], None, 0)
         for level in reversed(tuning.LEVELS):  # margins first: the search needs their loops last
             tuning.judge_candidate(task, "pi", {}, level)
+    _await(PI)  # the models are there then
+    first = signals.read_recording(recordings[0])
+    for name in dict.fromkeys((AUTO, linear_model())):
+        load(name).predict(first, 2)  # any horizon but one sample
     compiled_before().touch()
 
 

@@ -218,17 +218,31 @@ def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model_i
     monkeypatch.setattr(_compile_ahead.time, "sleep", comes)
     monkeypatch.setattr(_compile_ahead, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(softneck.signals, "read_recording", lambda name: name)
-    monkeypatch.setattr(_compile_ahead, "load", lambda name: _Family() if name == _plan.FAMILY else "best")
+    monkeypatch.setattr(_compile_ahead, "load", lambda name: _Family() if name == _plan.FAMILY else _Model(name, ran))
+    monkeypatch.setattr(_compile_ahead.gc, "set_threshold", lambda *_: None)
     _compile_ahead.compile_ahead("log.csv")
     # The search needs the loops of margins last, so these are compiled first: then the two cores do different ones.
-    best = [("best", "margins", True), ("best", "linear", True)] if nonlinear else []
-    assert ran == [("drawn",), ("drawn", "margins", False), ("drawn", "linear", False), *best]
+    auto = _Model("models/auto.npz", ran)
+    best = [(auto, "margins", True), (auto, "linear", True)] if nonlinear else []
+    # Last what the report predicts with: the best model and the best linear one.
+    report = [("log.csv", "models/auto.npz"), *([("log.csv", "models/auto_linear.npz")] if nonlinear else [])]
+    assert ran == [("drawn",), ("drawn", "margins", False), ("drawn", "linear", False), *best, *report]
     assert _compile_ahead.compiled_before().is_file()
 
 
 @dataclass(frozen=True)
 class _Family:
     draws: Any = field(default_factory=lambda: SimpleNamespace(model="drawn"))
+
+
+@dataclass(frozen=True)
+class _Model:
+    name: str
+    ran: list[tuple[Any, ...]] = field(compare=False, repr=False)
+
+    def predict(self, rows: str, horizon: int) -> None:
+        assert horizon > 1, "one sample ahead has a function of its own"
+        self.ran.append((rows, self.name))
 
 
 def test_what_is_compiled_ahead_ends_with_the_run_that_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
