@@ -1,5 +1,4 @@
 from ._metrics import MARGIN_GROUPS as MARGIN_GROUPS
-from ._metrics import METRIC_NAMES as METRIC_NAMES
 from ._page import verification_page as verification_page
 from ._requirements import Requirements as Requirements
 from ._requirements import make_requirements as make_requirements

@@ -154,10 +154,6 @@ def metric_names(robot: Robot, *, track: bool = False) -> tuple[str, ...]:
     )
 
 
-#: Names of all metrics of the neck.
-METRIC_NAMES = metric_names(Robot.preset())
-
-
 _GROUPS = {
     "stability": "every plant", "axes": "worst axis", "mimo": "all axes at once", "robust": "whole uncertainty",
     "step": "linear plants", "sim": "simulation", "track": "simulation",

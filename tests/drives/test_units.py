@@ -15,7 +15,6 @@ from softneck.drives.bus._units import (
     acceleration_to_internal,
     counts_to_position,
     current_to_internal,
-    internal_to_acceleration,
     internal_to_current,
     internal_to_speed,
     position_to_counts,
@@ -31,7 +30,6 @@ SCALES = st.builds(
 PAIRS = [
     pytest.param(position_to_counts, counts_to_position, 6.0, id="position"),
     pytest.param(speed_to_internal, internal_to_speed, 15.6, id="speed"),
-    pytest.param(acceleration_to_internal, internal_to_acceleration, 500.0, id="acceleration"),
     pytest.param(current_to_internal, internal_to_current, 5.0, id="current"),
 ]
 

@@ -91,11 +91,6 @@ def acceleration_to_internal(acceleration: float, scale: DriveScale) -> int:
     return _whole("acceleration", acceleration, _speed_factor(scale) * scale.slow_loop, "rad/s^2", _INT32)
 
 
-def internal_to_acceleration(units: int, scale: DriveScale) -> float:
-    """Return the winch acceleration [rad/s^2] of internal units."""
-    return units / (_speed_factor(scale) * scale.slow_loop)
-
-
 def current_to_internal(current: float, scale: DriveScale) -> int:
     """Return the internal units nearest to a motor current [A]: `current * 65520 / (2 I_peak)`.
 
