@@ -73,6 +73,7 @@ from ._kinds import kinds_of as kinds_of
 from ._kinds import make_settings as make_settings
 from ._metrics import METRICS as METRICS
 from ._metrics import metric_of as metric_of
+from ._metrics import unit_of_metric as unit_of_metric
 from ._metrics import worst as worst
 from ._units import AMBIGUOUS as AMBIGUOUS
 from ._units import SI_BASES as SI_BASES

@@ -85,12 +85,24 @@ METRICS = {
 
 def metric_of(name: str) -> Metric:
     """Return the metric of a name such as "sim.rise_s" or "motors.max_bar"; raise SettingsError if there is none."""
-    # What follows is a unit, or which of several runs: `load_rms_mm`, `rise_s`, `rise_s worst`, `holds [%]`.
-    last = f"{name.partition(' ')[0].rpartition('.')[2]}_"
-    known = max((key for key in METRICS if last.startswith(f"{key}_")), key=len, default=None)
-    if known is None:
+    known = _key_and_unit(name)[0]
+    if not known:
         raise SettingsError(f"`{name}` is not a metric of softneck; register it in `softneck.core._metrics`.")
     return METRICS[known]
+
+
+def unit_of_metric(name: str) -> str:
+    """Return the unit at the end of a metric's name, with a space before it; "" for none."""
+    unit = _key_and_unit(name)[1].replace("pct", "%").replace("_", "/")
+    return unit and f" {unit}"
+
+
+def _key_and_unit(name: str) -> tuple[str, str]:
+    """Return the key of a metric and what follows: a unit, or nothing; two empty texts for another name."""
+    # Which of several runs it is may follow too: `load_rms_mm`, `rise_s`, `rise_s worst`, `holds [%]`.
+    last = name.partition(" ")[0].rpartition(".")[2]
+    known = max((key for key in METRICS if f"{last}_".startswith(f"{key}_")), key=len, default="")
+    return known, last[len(known) + 1 :] if known else ""
 
 
 def worst(name: str, values: Iterable[float]) -> float:

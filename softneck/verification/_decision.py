@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from softneck.core import SettingsError, certifies, required_rows, to_si
+from softneck.core import SettingsError, certifies, required_rows, to_si, unit_of_metric
 from softneck.plots import cell
 
 from ._metrics import MARGIN_GROUPS, metric_title
@@ -98,8 +98,10 @@ def _undecided_words(metrics: Sequence[str]) -> str:
 
 
 def _requirement(row: Values) -> str:
-    value = "not computed" if row["value"] is None else cell(row["value"], ".3g")
+    metric = str(row["metric"])
+    unit = unit_of_metric(metric)
+    value = "not computed" if row["value"] is None else f"{cell(row['value'], '.3g')}{unit}"
     # A note says why a value within its limit does not count.
     note = f" ({row['note']})" if row["note"] else ""
     bound = _SIGNS.get(row["bound"], "at most")
-    return f"{metric_words(str(row['metric']))} {value}, required {bound} {cell(row['limit'], '.3g')}{note}"
+    return f"{metric_words(metric)} {value}, required {bound} {cell(row['limit'], '.3g')}{unit}{note}"
