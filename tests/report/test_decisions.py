@@ -252,8 +252,8 @@ def test_a_project_decides_on_model_controller_and_next_step() -> None:
         assert said == (
             "Use a.npz (nn): on rows it has not seen it simulates x 99.0 % (very good), y 99.0 % (very good). Do not "
             "run tune/best.npz (hinf) yet: 3 of 4 requirements fail: rise time, simulation 0.444 s, required at "
-            "most 0.4 s; gain margin, worst axis not computed, required at least 2.5 (no plant) and 1 more. Next: allow "
-            "a slower rise, or record another motion and start with both logs."
+            "most 0.4 s; gain margin, worst axis not computed, required at least 2.5 (no plant) and 1 more. Next: "
+            "allow a slower rise, or record another motion and start with both logs."
         )
     # A slower rise computes no margin.
     rows = [{**row, "note": "not computed: the controller adaptive has no linear form"} if row["value"] is None else row

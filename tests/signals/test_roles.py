@@ -232,6 +232,7 @@ def test_a_clock_of_two_seconds_is_as_titled_and_doubted(tmp_path: Path, title: 
     guess = guess_robot(write(tmp_path / "log.csv", {title: 100.0 * TIME, "cmd [V]": A, "x [mm]": ONE}))
     assert import_log(tmp_path / "log.csv", guess.layout).recording.sample_time == pytest.approx(2.0, rel=1e-6)
     assert any(doubt.channels == ("time",) for doubt in guess.doubts)
+    assert sum("unusual sample time" in line for line in guess.lines) == 1
 
 
 def test_names_keep_the_letters_under_accents_and_another_unit_is_the_reason(tmp_path: Path) -> None:

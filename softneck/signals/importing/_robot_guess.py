@@ -134,7 +134,8 @@ def guess_robot(
     if not whole:
         why = f"{_list(roles.motors)} move, {_list(roles.outputs)} are outputs"
         doubts.insert(0, Doubt("robot", robot.set_points[:1], why, 0.8, "by titles"))
-    said = [f"not sure: {doubt}" for doubt in doubts[not whole :]]
+    # Lines of a clock that was guessed say what is doubted of it.
+    said = [f"not sure: {doubt}" for doubt in doubts[not whole :] if clock is None or doubt not in of_clock]
     return RobotGuess(robot, layout, (*table.lines, *taken, *said, *roles.lines), tuple(doubts))
 
 

@@ -276,7 +276,7 @@ def test_a_log_whose_titles_are_of_another_robot_is_taken_for_one_and_that_is_do
     # The range of the recording stands for the limits that nobody gave, and that is doubted too.
     robot = Robot.read(tmp_path / "p" / "robot.toml")
     assert robot.motors.setpoint_max is not None
-    assert robot.motors.setpoint_max[0] == pytest.approx(recording.set_points.max(), rel=1e-2)  # three digits
+    assert robot.motors.setpoint_max == pytest.approx(tuple(recording.set_points.max(axis=0)), rel=1e-2)  # three digits
     assert any("range of the set-points" in line for line in facts["doubts"]["robot.toml"])
     # What was proposed is read again by its layout, and nothing is done twice.
     again = json.loads(call("start", "log.csv", "-o", "p", "--yes", "--json").out)
