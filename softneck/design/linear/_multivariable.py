@@ -72,10 +72,11 @@ def multivariable_controller(
                 f"the loop is not stable around sample {k} of {len(made.samples)} (spectral radius {found:.4f}); "
                 "design the controller for less."
             )
-    given, lead = reference_numbers(settings.reference_time)
-    if lead > 0.0:
+    given, lead, feedforward = reference_numbers(settings.reference_time)
+    if lead + feedforward > 0.0:
         raise SettingsError(
-            "a lead in `reference_time` is of plants whose axes do not answer to each other; leave it out."
+            "a lead in `reference_time`, or feedforward, is of plants whose axes do not answer to each other; leave it "
+            "out."
         )
     time = given or 0.0
     if settings.rise_s is not None:

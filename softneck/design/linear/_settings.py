@@ -44,6 +44,7 @@ from ._axis_loop import (
     unstable_samples,
 )
 from ._controller import AxisController, LinearController, ReferenceFilter, assemble
+from ._feedforward import follow_large_moves, follow_model
 from ._margins import Margins, require_stable
 from ._ports import ControllerLimits, limits_of
 
@@ -117,22 +118,23 @@ class LoopSettings:
         return 0 if self.order == "sequential" else 2
 
 
-def reference_numbers(given: Any) -> tuple[float | None, float]:
-    """Return T2 [s] and lead of a `reference_time`, which gives both or T2 alone.
+def reference_numbers(given: Any) -> tuple[float | None, float, float]:
+    """Return T2 [s], lead and feedforward of a `reference_time`, which gives all, the first two or T2 alone.
 
     Raises:
         SettingsError: no such filter.
     """
-    pair = given if isinstance(given, list | tuple) else (None if given == PLANT else given, 0.0)
-    if len(pair) != 2:
-        raise SettingsError(f"`reference_time` is T2 [s], or [T2, lead]; got {given!r}.")
-    time, lead = pair
+    numbers = list(given) if isinstance(given, list | tuple) else [None if given == PLANT else given, 0.0]
+    if len(numbers) not in (2, 3):
+        raise SettingsError(f"`reference_time` is T2 [s], [T2, lead] or [T2, lead, feedforward]; got {given!r}.")
+    time, lead, feedforward = numbers if len(numbers) == 3 else [*numbers, 0.0]
     if time is not None:
         require_between("reference_time", time, 0.0, 1e6, "s")
     require_between("the lead of `reference_time`", lead, 0.0, 10.0)
-    if lead > 0.0 and not time:
+    require_between("the feedforward of `reference_time`", feedforward, 0.0, 10.0)
+    if lead + feedforward > 0.0 and not time:
         raise SettingsError("a `reference_time` of [T2, lead] needs a T2 above 0.")
-    return time, lead
+    return time, lead, feedforward
 
 
 # A reference filter slower than this [samples] would be no answer to overshoot.
@@ -164,7 +166,9 @@ class AxisSettings(LoopSettings, ABC):
         reference_time: T2 of the reference filter (1 + T1 s)/(1 + T2 s) [s]; None for the least with which no sample
             overshoots a step of 10 deg by more than 4 %, from half the plant's lag on. Or T2 and lead, [0.2, 0.5]: T1
             is that part of the loop's own lag (its rise over ln 9); what moves is followed the closer, and a step
-            overshoots rather.
+            overshoots rather. Or T2, lead and feedforward, [0.1, 0.9, 1]: the filtered reference goes to the motors at
+            once, times the third over the plant's static gain, and the feedback compares the output with the plant's
+            response (model following). The plant is the nominal one, or of a family with draws the one of large steps.
     """
 
     KIND: ClassVar[str]
@@ -201,6 +205,8 @@ class AxisSettings(LoopSettings, ABC):
 
     def _design_axes(self, uncertain: UncertainPlant) -> LinearController:
         limits, redefinition = self.limits(uncertain.robot), uncertain.redefinition
+        if reference_numbers(self.reference_time)[2] > 0.0:
+            uncertain = follow_large_moves(uncertain, limits)
         axes = {name: self._prepare_axis(uncertain.axis(name)) for name in uncertain.names}
         axes = {
             name: replace(axis, test=axis_test(axis.nominal, limits, redefinition[1])) for name, axis in axes.items()
@@ -256,12 +262,15 @@ class AxisSettings(LoopSettings, ABC):
         plants = (axis.nominal, *axis.samples)
         require_stable(closed_poles(controller, plants[:1], self.extra_delay))
         self._require_stable(controller, axis)
+        feedforward = reference_numbers(self.reference_time)[2]
+        if feedforward > 0.0:
+            controller = follow_model(controller, axis.followed or axis.nominal, self.extra_delay, feedforward)
         led = self._choose_filter(controller, axis)
         controller = self._choose_conditioning(controller, led, axis)
         margins = axis_margins(controller, plants, self.extra_delay)
         worst = margins.worst()
         findings = {
-            "gains": {**found.gains, **filter_numbers(led)},
+            "gains": {**found.gains, **filter_numbers(led), **({"feedforward": feedforward} if feedforward else {})},
             "dead_time_s": (axis.nominal.delay + self.extra_delay) * axis.sample_time,
             "margins": margins_json(margins.of(0)),
             "states": int(controller.A.shape[0]),
@@ -291,7 +300,7 @@ class AxisSettings(LoopSettings, ABC):
             if axis.test is not None:
                 check_rise(self.rise_s, axis.nominal, axis.test)
             return filter_for(self.rise_s, controller, axis.nominal, self.extra_delay)
-        time, lead = reference_numbers(self.reference_time)
+        time, lead, _ = reference_numbers(self.reference_time)
         if time is not None:
             return leading_filter(time, lead, controller, axis.nominal, self.extra_delay)
         return ReferenceFilter(self._least_filter_time(controller, axis))

@@ -20,6 +20,7 @@ from softneck.core import (
     require_positive,
 )
 from softneck.estimation import AXES, AxisPlant, LinearNeck, axis_plant, directions_of, robot_of
+from softneck.identification import Draws
 from softneck.robot import TIME_CONSTANT, Robot
 from softneck.signals import require_same_robot
 
@@ -166,7 +167,8 @@ class UncertainAxis:
     `nominal`: the plant that synthesis takes. `samples`: every plant that the controller must hold on; the nominal one
     is the first. `test`: what a controller is judged by on all of them; None where nobody judges. `uncertainty`: what
     is allowed for besides. `family`: how many plants were given, 1 for a model alone. `band`: lowest and highest
-    frequency [rad/s] that their recordings support; None where it is not known.
+    frequency [rad/s] that their recordings support; None where it is not known. `followed`: whose response a feedback
+    beside feedforward follows; None: that of the nominal one.
     """
 
     nominal: AxisPlant
@@ -175,6 +177,7 @@ class UncertainAxis:
     uncertainty: ModelUncertainty = _NO_UNCERTAINTY
     family: int = 1
     band: tuple[float, float] | None = None
+    followed: AxisPlant | None = None
 
     @property
     def sample_time(self) -> float:
@@ -183,7 +186,7 @@ class UncertainAxis:
 
     def same_as(self, other: UncertainAxis) -> bool:
         """Return whether both are the same plants, so that one synthesis does for both."""
-        mine, its = (self.nominal, *self.samples), (other.nominal, *other.samples)
+        mine, its = ((item.followed or item.nominal, item.nominal, *item.samples) for item in (self, other))
         return len(mine) == len(its) and all(
             a.delay == b.delay
             and np.array_equal(a.numerator, b.numerator)
@@ -214,13 +217,14 @@ class UncertainPlant(ReprMixin):
 
     `axes`: output -> what its axis may be. `robot`: whose plant it is. `weights`: (outputs, motors) of the motors in
     the redefined input of each axis; None: those that the robot gives. `uncertainty`: what a design allows for; None
-    for what is usual of the robot.
+    for what is usual of the robot. `draws`: nonlinear models of the plant; None where there are none.
     """
 
     axes: Mapping[str, UncertainAxis]
     robot: Robot = field(default_factory=Robot.preset)
     weights: Matrix | None = None
     uncertainty: ModelUncertainty | None = None
+    draws: Draws | None = None
 
     @property
     def sample_time(self) -> float:
@@ -300,7 +304,7 @@ def uncertain_plant(source: Any, robot: Robot | None = None) -> UncertainPlant:
         for item in each[1:]:
             require_same_robot(item.robot, each[0].robot, "plants")
         joined = {axis: [s for item in each for s in item.axis(axis).samples] for axis in each[0].names}
-        return replace(_combine_axes(joined), robot=each[0].robot, weights=each[0].weights)
+        return replace(_combine_axes(joined), robot=each[0].robot, weights=each[0].weights, draws=each[0].draws)
     if isinstance(source, control.StateSpace | control.TransferFunction):
         return _combine_axes({axis: [_axis_from_system(_of_system(source, axis), axis, "the plant")] for axis in AXES})
     if not hasattr(source, "tf"):
@@ -312,7 +316,7 @@ def uncertain_plant(source: Any, robot: Robot | None = None) -> UncertainPlant:
     joined = _combine_axes({axis: _of_model(source, axis) for axis in robot.outputs.names})
     if callable(band := getattr(source, "band", None)):
         joined = replace(joined, axes={axis: replace(item, band=band(axis)) for axis, item in joined.axes.items()})
-    return replace(joined, robot=robot, weights=directions_of(source))
+    return replace(joined, robot=robot, weights=directions_of(source), draws=getattr(source, "draws", None))
 
 
 def _of_model(model: Any, axis: str) -> list[AxisPlant]:
