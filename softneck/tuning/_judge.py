@@ -35,8 +35,10 @@ from softneck.verification import (
     loops_under_test,
     make_simulation_model,
     margins,
+    oscillating_share,
     run_drawn,
     run_steps,
+    run_steps_on_draws,
     sources_of,
     start_of,
     step_loop,
@@ -45,10 +47,12 @@ from softneck.verification import (
 )
 
 from ._requirements import TuneRequirements, can_follow_circle, default_payloads
-from ._task import Judgement, Task, circle_angles, curve_times, has_observer
+from ._task import MARGINS, Judgement, Task, circle_angles, curve_times, has_observer
 
 # Time to reach the circle [s], and turns, of which the last is judged.
 _LEAD_IN_S, _TURN_COUNT = 2.0, 2.0
+# Draws that lead a search: as many that overshoot most and as many that rise last.
+_HARDEST = 4
 # Longest preview of a reference [s].
 _MAX_PREVIEW_S = 0.8
 
@@ -71,8 +75,10 @@ class Case:
     circle: bool = False
 
 
-def cases(own: Sequence[SimulationModel], asked: TuneRequirements, robot: Robot) -> tuple[Case, ...]:
-    """Return all loops of a search."""
+def cases(
+    own: Sequence[SimulationModel], asked: TuneRequirements, robot: Robot, drawn: Sequence[str] = ()
+) -> tuple[Case, ...]:
+    """Return all loops of a search; of draws not those that `run_steps_on_draws` makes, but one for the curves."""
     table, small = asked.certificate.sim, asked.track["small_part"]
     payloads = sorted({float(kg) for kg in table["payloads_kg"]})
     angles = [math.radians(a) for a in table["orientations_deg"]] if len(robot.outputs.names) > 1 else [0.0]
@@ -80,7 +86,10 @@ def cases(own: Sequence[SimulationModel], asked: TuneRequirements, robot: Robot)
     for number, plant in enumerate(own):
         for kg in plant.payloads(payloads):
             # Loops of `verify` have no noise, with which the rise looks shorter.
-            found += [Case(number, kg, angle, noise=noisy) for angle in angles for noisy in (False, True)]
+            found += (
+                [Case(number, kg, min(angles, key=abs))] if plant.name in drawn
+                else [Case(number, kg, angle, noise=noisy) for angle in angles for noisy in (False, True)]
+            )  # fmt: skip
             found += [Case(number, kg, angle, part=small, noise=True) for angle in (angles[0], angles[-1])]
             found.append(Case(number, kg, angles[0], noise=True, late=True))
             if can_follow_circle(robot):
@@ -240,8 +249,12 @@ def judge_candidate(task: Task, kind: str, settings: Mapping[str, Any], level: s
         eyes = make_observer(task, kind)
         if level == "margins":
             return Judgement(margin_metrics(task, ready, block, order, eyes))
-        curves = loop_curves(task, ready, block, order, eyes)
-        return Judgement(loop_metrics(task, ready, block, order, ready.all, eyes), curves=curves)
+        found = loop_metrics(task, ready, block, order, ready.all, eyes)
+        if task.hardest:
+            linear = linear_metrics(task, ready, controller)
+            found |= {name: value for name, value in linear.items() if name not in MARGINS}
+            found |= drawn_metrics(task, block, order, eyes)
+        return Judgement(found, curves=loop_curves(task, ready, block, order, eyes))
     except SoftneckError as error:
         return Judgement({}, " ".join(str(error).split()))
 
@@ -256,7 +269,7 @@ def prepare(task: Task) -> Ready:
         own = tuple(make_simulation_model(thing, name, task.robot) for name, thing in task.own.items())
         kept["ready"] = Ready(
             plants, sources[0].weights, uncertain_plant(task.plant), own,
-            cases(own, task.asked, task.robot),
+            cases(own, task.asked, task.robot, task.drawn),
         )  # fmt: skip
     return kept["ready"]
 
@@ -349,6 +362,43 @@ def loop_metrics(
         name_of = task.asked.certificate.scale.name_of
         found |= {f"track.{name_of('ahead_rms_deg')}": float(most[best]), "track.ahead_s": best * Ts,
                   f"track.{name_of('circle_rms_deg')}": float(most[0])}  # fmt: skip
+    return found
+
+
+def drawn_metrics(task: Task, block: Block, order: str, observer: Block | None) -> dict[str, float]:
+    """Return the worst metrics of the steps of the hardest draws, and a gain margin.
+
+    It is that which the search aims at if none of them oscillates there, else less.
+    """
+    found: dict[str, float] = {}
+    aims = [item.limit for item in task.aims if item.metric == MARGINS[0] and item.bound == "min"]
+    for name, numbers in task.hardest.items():
+        where = {"order": order, "observer": observer, "numbers": numbers}
+        draws, asked = task.linear[name].draws, task.asked.certificate
+        for metric, each in run_steps_on_draws(name, draws, block, asked, **where).items():
+            keep_worse(found, metric, worst(metric, each))
+        for aim in aims:
+            lost = oscillating_share(name, draws, block, asked, gain=aim, **where)
+            keep_worse(found, MARGINS[0], aim / (1.0 + lost))
+    return found
+
+
+def hardest_draws(task: Task, kind: str, settings: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Return family -> numbers of its draws on which a controller overshoots most or rises last.
+
+    The disturbance of a draw is the same for all controllers, so these are hard for others as well.
+    """
+    controller, found = design_candidate(task, prepare(task), kind, settings), {}
+    order, eyes = str(getattr(controller, "order", "sequential")), make_observer(task, kind)
+    for name, thing in task.linear.items():
+        if getattr(thing, "draws", None) is not None:
+            values = run_steps_on_draws(
+                name, thing.draws, controller.block(), task.asked.certificate, order=order, observer=eyes,
+                numbers=range(len(thing.draws.for_search())),
+            )  # fmt: skip
+            each = [np.argsort(-np.nan_to_num(values[f"sim.{metric}"], nan=np.inf), kind="stable")[:_HARDEST]
+                    for metric in ("overshoot_pct", "rise_s")]  # fmt: skip
+            found[name] = tuple(np.unique(each).tolist())
     return found
 
 

@@ -1,7 +1,7 @@
 """Search over kinds and settings by successive halving and CMA-ES.
 
-Each kind starts with the largest bound on Ms that its margins allow, found by bisection, and is judged there by loops;
-where draws of a family decide, also at a smaller one.
+Each kind starts with the largest bound on Ms that its margins allow, found by bisection, and is judged there by loops.
+Where draws of a family decide, the hardest of them lead, and a kind begins at its start or at a smaller bound.
 After the start and each round the better third of the kinds continues (successive halving: Jamieson and Talwalkar
 2016, AISTATS). Each kind has its own CMA-ES over its unit cube (Hansen and Ostermeier 2001, Evolutionary Computation
 9:159). It uses ranks alone, so candidates of different levels can be mixed. At least half of the candidates continue
@@ -10,10 +10,11 @@ to the next level. Finally, neighbours of the best are searched. The number of w
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from softneck.core import Progress, SoftneckError, worst
 from softneck.cosim import WorkerPool
 from softneck.verification import Requirement
 
-from ._judge import LEVELS, judge_candidate
+from ._judge import LEVELS, hardest_draws, judge_candidate
 from ._space import COSTLY, Space
 from ._task import Job, Judgement, Log, Task
 
@@ -92,18 +93,21 @@ class Candidate:
                 found[item.metric] = max(found.get(item.metric, 0.0), ratio(item, value))
         return found
 
-    def cost(self, bounds: Sequence[Requirement], *, tested: bool) -> float:
+    def cost(self, bounds: Sequence[Requirement], *, tested: bool, aim: str = "") -> float:
         """Return the cost, at most 1 where all known requirements hold.
 
-        It is the largest ratio where all hold, else 1 plus the sum of x/(1 + x/4) over the excesses x beyond 1: an
-        exact penalty (Nocedal and Wright 2006, sec. 17.2).
+        It is the largest ratio where all hold, or that of the metric `aim`, else 1 plus the sum of x/(1 + x/4) over the
+        excesses x beyond 1: an exact penalty (Nocedal and Wright 2006, sec. 17.2).
         """
-        found = list(self.ratios(bounds, tested=tested).values())
+        each = self.ratios(bounds, tested=tested)
+        found = list(each.values())
         if self.error or not found:
             return math.inf
         beyond = sum(_saturate(max(value - 1.0, 0.0)) for value in found)
         rest = _TIE_WEIGHT * float(np.mean([min(value, 1.0) for value in found]))
-        return (1.0 + beyond if beyond > 0.0 else (1.0 - _TIE_WEIGHT) * max(found)) + rest
+        if beyond > 0.0:
+            return 1.0 + beyond + rest
+        return (1.0 - _TIE_WEIGHT) * each.get(aim, max(found)) + rest
 
     def holds(self, bounds: Sequence[Requirement], *, tested: bool) -> bool:
         """Return whether every known requirement holds."""
@@ -150,6 +154,8 @@ class Search:
     @property
     def levels(self) -> Sequence[str]:
         """The levels of all candidates; margins by experiment, and other loops, need simulation models."""
+        if self.task.drawn:
+            return LEVELS[1:-1]
         return LEVELS[:-1] if self.task.own else LEVELS[:1]
 
     def run(self) -> None:
@@ -193,7 +199,7 @@ class Search:
 
     def cost(self, item: Candidate) -> float:
         """Return the cost of a candidate."""
-        return item.cost(self.task.aims, tested=self.task.tested)
+        return item.cost(self.task.aims, tested=self.task.tested, aim="sim.rise_s" if self.task.drawn else "")
 
     def _candidates_of(self, kind: str) -> list[Candidate]:
         return [item for item in self.candidates.values() if item.kind == kind]
@@ -208,8 +214,11 @@ class Search:
     def _judge_starts(self, levels: Sequence[str], finals: int, optimisers: dict[str, Any]) -> list[Space]:
         """Judge each kind at its start; return the remaining kinds and move their optimisers there."""
         starts = {space.kind: self._candidate(space, space.start) for space in self.spaces}
+        if self.task.drawn:
+            self._choose_draws(list(starts.values()))
         self._judge(list(starts.values()), levels[0], finals)
-        starts = self._move_starts(starts, finals + (len(levels) - 1) * len(starts))
+        if not self.task.drawn:
+            starts = self._move_starts(starts, finals + (len(levels) - 1) * len(starts))
         for level in levels[1:]:
             self._judge(list(starts.values()), level, finals)
         if self.task.drawn:
@@ -219,6 +228,13 @@ class Search:
             if not np.array_equal(starts[space.kind].x, space.start):
                 optimisers[space.kind] = _optimiser(space, self.task.seed, number, starts[space.kind].x)
         return self._drop_kinds([space for space in self.spaces if space.kind not in self.dropped])
+
+    def _choose_draws(self, starts: Sequence[Candidate]) -> None:
+        """Choose the draws that lead the search: the hardest of the first start that can be designed."""
+        for item in starts:
+            with contextlib.suppress(SoftneckError):
+                self.task = replace(self.task, hardest=hardest_draws(self.task, item.kind, item.settings))
+                return
 
     def _judge_detuned(self, starts: dict[str, Candidate], levels: Sequence[str], finals: int) -> dict[str, Candidate]:
         """Return the better of each start and of a detuned one: with the least allowed margins a kind overshoots."""

@@ -67,6 +67,8 @@ _RISE_MARGIN = 1.03
 _LEAD_LIMIT_RAD = 0.6
 # The second number of `reference_time`.
 _LEAD = Dimension("lead", 0.2, 2.5, 1.0)
+# The third, where draws of a family decide.
+_FEEDFORWARD = Dimension("feedforward", 0.6, 1.4, 0.9)
 # How far a detuned design is from another, as shares of the ranges.
 _DETUNED = {"max_sensitivity": 0.1, _LEAD.name: 0.28}
 # Kinds for which `lead_limit` is searched.
@@ -106,18 +108,20 @@ class Space:
             item.name: item.value(float(part)) for item, part in zip(self.dimensions, x, strict=True)
         }
         if _LEAD.name in searched:
-            searched["reference_time"] = [searched["reference_time"], searched.pop(_LEAD.name)]
+            names = [name for name in (_LEAD.name, _FEEDFORWARD.name) if name in searched]
+            searched["reference_time"] = [searched["reference_time"], *(searched.pop(name) for name in names)]
         return {**self.fixed, **searched}
 
 
 def spaces(
-    kinds: tuple[str, ...], *, rise: float, cocontraction: float | None, robot: Robot, least: float = 0.0
-) -> list[Space]:
+    kinds: tuple[str, ...], *, rise: float, cocontraction: float | None, robot: Robot, least: float = 0.0,
+    drawn: bool = False,
+) -> list[Space]:  # fmt: skip
     """Return the space of every kind.
 
     `rise` and `least` [s] are the longest allowed rise and the shortest of the motors; `cocontraction` is that of the
-    recordings [SI], or None. Only tendons on winches need a `lead_limit`. Raises SettingsError: an
-    unknown kind, or one with nothing to search.
+    recordings [SI], or None; `drawn`: whether draws of a family decide. Only tendons on winches need a `lead_limit`.
+    Raises SettingsError: an unknown kind, or one with nothing to search.
     """
     found, least = [], min(least, rise)
     lead = Scaling.of(robot).motor_unit if robot.tendon_angles is not None else None
@@ -131,12 +135,13 @@ def spaces(
             )
             raise SettingsError(f"{what}; use some of {', '.join(_DIMENSIONS)}.")
         settings = resolve(KINDS[kind].settings)
-        names = {_LEAD.name, *(item.name for item in dataclasses.fields(settings))}
+        names = {_LEAD.name, _FEEDFORWARD.name, *(item.name for item in dataclasses.fields(settings))}
         low, start = max(0.3 * rise, _RISE_MARGIN * least), max(_RISE_RATIO * rise, _RISE_MARGIN**2 * least)
         speed: tuple[Dimension, ...] = (Dimension("rise_s", low, 1.2 * rise, start),)
         if issubclass(settings, AxisSettings):
             # With a lead a step reaches the motors' limits at once and a circle is followed more closely.
             speed = (Dimension("reference_time", 0.05 * rise, 0.6 * rise, 0.25 * rise), _LEAD)
+            speed = (*speed, _FEEDFORWARD) if drawn else speed
         wanted = (*speed, *_DIMENSIONS[kind], *(planned if kind in _PREDICTIVE_KINDS else ()))
         fixed: dict[str, Any] = (
             {"lead_limit": _LEAD_LIMIT_RAD * lead} if lead is not None and kind not in _PREDICTIVE_KINDS else {}

@@ -62,6 +62,7 @@ class Task:
         seed: of the noise.
         observer: in the loops of `mpc` and `nmpc`; None for none.
         drawn: names of those in `own` that are draws of a family; certificates have others.
+        hardest: family -> numbers of its draws on which a start does worst, those of every loop of the search.
     """
 
     digest: str
@@ -73,6 +74,7 @@ class Task:
     seed: int
     observer: Any = None
     drawn: tuple[str, ...] = ()
+    hardest: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     @property
     def bounds(self) -> tuple[Requirement, ...]:

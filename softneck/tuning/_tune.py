@@ -170,7 +170,7 @@ def tune(
         require_same_robot(robot_of(observer), task.robot, "the observer and the plants")
     check_feasibility(task.asked, task.plant)
     each = spaces(
-        chosen, rise=_target_rise(task), robot=task.robot, least=fastest_rise(task.plant),
+        chosen, rise=_target_rise(task), robot=task.robot, least=fastest_rise(task.plant), drawn=bool(task.drawn),
         cocontraction=None if task.cocontraction is None else float(f"{task.cocontraction:.4g}"),
     )  # fmt: skip
     task = replace(task, observer=_observer(task) if observer is None else observer)

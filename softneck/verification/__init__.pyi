@@ -15,7 +15,9 @@ from ._decision import has_drives as has_drives
 from ._decision import metric_words as metric_words
 from ._decision import verdict_values as verdict_values
 from ._drawn import Drawn as Drawn
+from ._drawn import oscillating_share as oscillating_share
 from ._drawn import run_drawn as run_drawn
+from ._drawn import run_steps_on_draws as run_steps_on_draws
 from ._experiments import crossing_values as crossing_values
 from ._experiments import crossings as crossings
 from ._linear import LARGE as LARGE

@@ -174,17 +174,51 @@ def run_drawn(
     return replace(found, unreached=_unreached(draws, asked), noisy=not shows_settling(_noise(draws, asked), size))
 
 
+def run_steps_on_draws(
+    name: str, draws: Draws, controller: Block, asked: Requirements, *, order: str, observer: Block | None,
+    numbers: Sequence[int],
+) -> dict[str, Vector]:  # fmt: skip
+    """Return metric -> the worst value in the steps of each of these draws of a search, as `run_drawn` makes them."""
+    task = _task_of(name, draws, controller, asked, order, observer, 0)
+
+    def one(number: int) -> dict[str, float]:
+        return {metric: worst(metric, [value for value, _ in found]) for metric, found in _steps(task, number).items()}
+
+    results = [one(numbers[0])]
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        results += list(pool.map(one, numbers[1:]))
+    return {metric: np.array([found[metric] for found in results]) for metric in results[0]}
+
+
+def oscillating_share(
+    name: str, draws: Draws, controller: Block, asked: Requirements, *, order: str, observer: Block | None,
+    numbers: Sequence[int], gain: float,
+) -> float:  # fmt: skip
+    """Return the share of these draws of a search that oscillate with all loop gains times or over `gain`."""
+    task = _task_of(name, draws, controller, asked, order, observer, 0)
+    task = replace(task, limits={_MARGINS[0]: gain}, amplitudes=task.amplitudes[-1:])
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        found = list(pool.map(lambda number: _margins(task, number, whole_only=True), numbers))
+    return sum(any(item.oscillates for item in each) for each in found) / len(found)
+
+
+def _task_of(
+    name: str, draws: Draws, controller: Block, asked: Requirements, order: str, observer: Block | None, attempt: int
+) -> _Task:
+    models = _models(draws, attempt)
+    plants = [make_simulation_model(model, f"draw {k + 1} of {name}", asked.robot) for k, model in enumerate(models)]
+    inverse = asked.robot.redefinition(directions_of(draws.model))[1]
+    return _Task(
+        controller, asked, order, observer, draws, plants, _required_margins(asked), _amplitudes(draws, asked), inverse
+    )
+
+
 def _run_all(
     name: str, draws: Draws, controller: Block, asked: Requirements, order: str, observer: Block | None, attempt: int,
     progress: Progress,
 ) -> Drawn:  # fmt: skip
-    models = _models(draws, attempt)
-    plants = [make_simulation_model(model, f"draw {k + 1} of {name}", asked.robot) for k, model in enumerate(models)]
-    inverse = asked.robot.redefinition(directions_of(draws.model))[1]
-    task = _Task(
-        controller, asked, order, observer, draws, plants, _required_margins(asked), _amplitudes(draws, asked), inverse
-    )
-    done = 0
+    task = _task_of(name, draws, controller, asked, order, observer, attempt)
+    plants, done = task.plants, 0
 
     def one(number: int) -> tuple[dict[str, list[tuple[float, str]]], list[_Margin]]:
         nonlocal done
@@ -344,8 +378,11 @@ def _load_rms(result: LoopResult, first: int, asked: Requirements) -> float:
     return float(asked.scale.shown(worst("load_rms", errors)))
 
 
-def _margins(task: _Task, number: int) -> list[_Margin]:
-    """Run a draw at each required margin: of each axis at the lightest payload, of all at once at the heaviest too."""
+def _margins(task: _Task, number: int, *, whole_only: bool = False) -> list[_Margin]:
+    """Run a draw at each required margin: of each axis at the lightest payload, of all at once at the heaviest too.
+
+    `whole_only`: of all axes at once alone.
+    """
     plant, asked, found = task.plants[number], task.asked, []
     names, kg = asked.robot.outputs.names, _payloads(plant, asked)
     whole = names if len(names) == 1 else (*names, "both")
@@ -359,11 +396,12 @@ def _margins(task: _Task, number: int) -> list[_Margin]:
         posture = tuple(test.size * angle for angle in test.postures()[number % 3])
         for amplitude in task.amplitudes:
             floor = Experiment(test, whole[-1], "gain_up", amplitude, posture).floor()
-            for axes in whole if weight == kg[0] else whole[-1:]:
+            for axes in whole if weight == kg[0] and not whole_only else whole[-1:]:
                 for metric, limit in task.limits.items():
                     found += _at_limit(
                         Experiment(test, axes, "", amplitude, posture), floor, metric, limit, number,
-                        whole=axes == whole[-1], ranks=axes == whole[-1] and amplitude != task.amplitudes[0],
+                        whole=axes == whole[-1],
+                        ranks=not whole_only and axes == whole[-1] and amplitude != task.amplitudes[0],
                     )  # fmt: skip
     return found
 

@@ -454,7 +454,7 @@ def task_for(table: dict[str, Any], robot: str | Robot = "neck", time: float = 1
     )
     return SimpleNamespace(
         **{"asked": asked, "robot": asked.certificate.robot, "cocontraction": None, "seed": 3, "own": {}, "linear": {},
-           "drawn": (), "models": [], "observer": None, **more}
+           "drawn": (), "hardest": {}, "models": [], "observer": None, **more}
     )  # fmt: skip
 
 
@@ -464,7 +464,9 @@ CONDITIONS = {"sim": {"payloads_kg": [0.5, 0.0], "orientations_deg": [0.0, 45.0,
 @pytest.mark.parametrize("robot", ["neck", "finger"])
 def test_every_plant_payload_direction_and_size_is_a_loop_and_a_circle_where_there_are_two_angles(robot: str) -> None:
     task = task_for(CONDITIONS, robot)
-    own: list[Any] = [SimpleNamespace(payloads=lambda kg: kg), SimpleNamespace(payloads=lambda _: [1.0])]
+    own: list[Any] = [
+        SimpleNamespace(name="a", payloads=lambda kg: kg), SimpleNamespace(name="b", payloads=lambda _: [1.0])
+    ]  # fmt: skip
     found = cases(own, task.asked, task.robot)
     angles = [0.0, math.pi / 4, math.pi / 2] if robot == "neck" else [0.0]
     expected = set()
@@ -475,6 +477,11 @@ def test_every_plant_payload_direction_and_size_is_a_loop_and_a_circle_where_the
         expected |= {Case(plant, kg, 0.0, 1.0, noise=False, late=False, circle=True)} if robot == "neck" else set()
     assert set(found) == expected
     assert len(found) == len(expected)
+    # Of a draw the full-size steps are others' but for one, which the curves show.
+    drawn = cases(own, task.asked, task.robot, ("b",))
+    assert {case for case in expected if case.plant == 0} <= set(drawn) < expected
+    steps = [case for case in drawn if case.plant == 1 and case.part == 1.0 and not (case.late or case.circle)]
+    assert steps == [Case(1, 1.0, 0.0)]
 
 
 def _port(name: str, start: float = 0.0) -> Any:
@@ -714,6 +721,36 @@ def test_one_family_that_was_tested_against_its_recordings_is_enough(
     assert Task.tested.fget(task) is (any(measured) and not drawn)  # pyright: ignore[reportOptionalCall]
 
 
+def test_the_hardest_draws_overshoot_most_or_rise_last_and_one_that_fails_is_hard(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    values = {"sim.overshoot_pct": np.arange(12.0) % 7, "sim.rise_s": np.r_[np.nan, np.inf, np.arange(10.0)]}
+    monkeypatch.setattr(_judge, "prepare", lambda _: None)
+    monkeypatch.setattr(_judge, "design_candidate", lambda *_: SimpleNamespace(block=lambda: "block", order="jacobi"))
+    monkeypatch.setattr(_judge, "run_steps_on_draws", lambda *_, **__: values)
+    draws = SimpleNamespace(for_search=lambda: range(12))
+    task = task_for({}, linear={"f": SimpleNamespace(draws=draws), "m": SimpleNamespace()})
+    # 6 and 5, twice 4 or 11; no number, infinity, then the two that rise last.
+    assert _judge.hardest_draws(task, "pi", {}) == {"f": (0, 1, 4, 5, 6, 10, 11)}
+
+
+@pytest.mark.parametrize(("lost", "margin"), [(0.0, 2.2), (0.5, 2.2 / 1.5), (1.0, 1.1)])
+def test_of_the_hardest_draws_the_worst_counts_and_each_that_oscillates_lowers_the_margin(
+    lost: float, margin: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Any] = []
+    steps = {"f": np.array([1.0, 3.0]), "g": np.array([2.0])}
+    monkeypatch.setattr(_judge, "run_steps_on_draws", lambda name, *_, **__: {"sim.rise_s": steps[name]})
+    monkeypatch.setattr(_judge, "oscillating_share", lambda name, *_, **more: told.append((name, more)) or lost)
+    linear = {name: SimpleNamespace(draws=name) for name in "fg"}
+    aims = (Requirement("axes.gain_margin", "min", 2.2, False), Requirement("sim.rise_s", "max", 2.2, False))
+    task = task_for({}, linear=linear, aims=aims, hardest={"f": (1, 2), "g": (0,)})
+    found = _judge.drawn_metrics(task, "block", "jacobi", None)  # pyright: ignore[reportArgumentType]
+    assert found == {"sim.rise_s": 3.0, "axes.gain_margin": margin}
+    where = {"order": "jacobi", "observer": None, "gain": 2.2}
+    assert told == [("f", {**where, "numbers": (1, 2)}), ("g", {**where, "numbers": (0,)})]
+
+
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("own", [True, False])
 def test_each_level_computes_its_own_and_an_error_of_a_design_is_told(
@@ -724,7 +761,9 @@ def test_each_level_computes_its_own_and_an_error_of_a_design_is_told(
     monkeypatch.setattr(_judge, "prepare", lambda _: ready)
     monkeypatch.setattr(_judge, "design_candidate", lambda *_: controller)
     monkeypatch.setattr(_judge, "make_observer", lambda *_: "eyes")
-    for name in ("linear_metrics", "loop_metrics", "margin_metrics", "linear_curves", "loop_curves"):
+    for name in (
+        "linear_metrics", "loop_metrics", "margin_metrics", "drawn_metrics", "linear_curves", "loop_curves"
+    ):  # fmt: skip
         monkeypatch.setattr(_judge, name, lambda *args, name=name: {name: args[2:]})
     found = judge_candidate(task_for({}), "pi", {}, level)
     if level == "linear":
@@ -736,6 +775,12 @@ def test_each_level_computes_its_own_and_an_error_of_a_design_is_told(
         assert found.metrics == {"loop_metrics": ("block", "parallel", ("case",), "eyes")}
         assert found.curves == {"loop_curves": ("block", "parallel", "eyes")}
     assert not found.error
+    if level == "all":
+        led = judge_candidate(task_for({}, hardest={"family": (3,)}), "pi", {}, level)
+        assert led.metrics == {
+            "loop_metrics": ("block", "parallel", ("case",), "eyes"), "linear_metrics": (controller,),
+            "drawn_metrics": ("parallel", "eyes"),
+        }  # fmt: skip
 
     def fails(*_: Any) -> Any:
         raise SettingsError("no\n  way")
@@ -936,8 +981,10 @@ def test_where_draws_decide_a_kind_begins_at_the_better_of_its_limits_and_of_a_d
 ) -> None:
     search = searching("ab", drawn=drawn)
     search.spaces = list(spaces(("pi", "mpc"), rise=0.5, cocontraction=None, robot=Robot.preset()))
-    monkeypatch.setattr(Search, "_move_starts", lambda _, starts, __: starts)
+    moved: list[str] = []
+    monkeypatch.setattr(Search, "_move_starts", lambda _, starts, __: moved.extend(starts) or starts)
     monkeypatch.setattr(Search, "_drop_kinds", lambda _, alive: alive)
+    monkeypatch.setattr(Search, "_choose_draws", lambda _, starts: moved.append(f"draws of {starts[0].kind}"))
     best = {"pi": 1.3, "mpc": 9.0}
 
     def judge(_: Any, items: Any, level: str, __: int) -> None:
@@ -949,6 +996,8 @@ def test_where_draws_decide_a_kind_begins_at_the_better_of_its_limits_and_of_a_d
     optimisers: dict[str, Any] = dict.fromkeys(("pi", "mpc"))
     search._judge_starts(LEVELS[:2], 0, optimisers)
     pi, mpc = search.spaces
+    # Margins by linear methods lead where no draws do.
+    assert moved == (["draws of pi"] if drawn else ["pi", "mpc"])
     assert optimisers["mpc"] is None
     if not drawn:
         assert optimisers["pi"] is None
@@ -959,6 +1008,33 @@ def test_where_draws_decide_a_kind_begins_at_the_better_of_its_limits_and_of_a_d
     assert detuned["reference_time"][1] < pi.settings(pi.start)["reference_time"][1]
     # At the end of the ranges nothing is detuned.
     np.testing.assert_array_equal(mpc.detuned(0.0 * mpc.start), 0.0 * mpc.start)
+
+
+def test_the_hardest_draws_of_the_first_start_that_can_be_designed_lead(monkeypatch: pytest.MonkeyPatch) -> None:
+    def hardest(_: Any, kind: str, __: Any) -> dict[str, tuple[int, ...]]:
+        if kind == "a":
+            raise SettingsError("no way")
+        return {kind: (1, 2)}
+
+    monkeypatch.setattr(_search, "hardest_draws", hardest)
+    search = searching("abc")
+    asked: Any = SimpleNamespace(bounds=())
+    search.task = Task(digest="", linear={}, own={}, asked=asked, robot=Robot.preset(), seed=0, drawn=("d",))
+    search._choose_draws([of_kind(kind, 0.5) for kind in "abc"])
+    assert search.task.hardest == {"b": (1, 2)}
+    search._choose_draws([of_kind("a", 0.5)])
+    assert search.task.hardest == {"b": (1, 2)}
+
+
+def test_once_all_requirements_hold_the_aim_alone_counts_and_no_failure_is_bought_with_it() -> None:
+    slow = Candidate("a", {}, np.zeros(1), "all", {"m": 0.2, "sim.rise_s": 0.9, "axes.sensitivity": 1.0})
+    fast = replace(slow, metrics={**slow.metrics, "m": 0.95, "sim.rise_s": 0.5})
+    wrong = replace(slow, metrics={**slow.metrics, "m": 1.01, "sim.rise_s": 0.1})
+    bounds = (Requirement("m", "max", 1.0, True), Requirement("sim.rise_s", "max", 1.0, False))
+    cost = [item.cost(bounds, tested=False, aim="sim.rise_s") for item in (fast, slow, wrong)]
+    assert cost[0] < cost[1] < 1.0 < cost[2]
+    # Without one it is the largest ratio.
+    assert slow.cost(bounds, tested=False) < fast.cost(bounds, tested=False) < 1.0
 
 
 def test_of_two_starts_that_are_alike_the_one_at_its_limits_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,8 +18,16 @@ from softneck.identification.uncertainty import _draws
 from softneck.loop import LoopResult
 from softneck.robot import Robot
 from softneck.verification import Requirement, _drawn, make_requirements, verify
-from softneck.verification._drawn import Drawn, _Margin, certified_content, draws_of, run_drawn
-from softneck.verification._experiments import Experiment, LoopUnderTest, crossing_values, crossings
+from softneck.verification._drawn import (
+    Drawn,
+    _Margin,
+    certified_content,
+    draws_of,
+    oscillating_share,
+    run_drawn,
+    run_steps_on_draws,
+)
+from softneck.verification._experiments import Experiment, LoopUnderTest, bisect, crossing_values, crossings
 from softneck.verification._neck_loops import loops_under_test, make_simulation_model, rows_of
 
 from .necks import COUNT, QUICK, TS, family, pi, small_draws
@@ -105,6 +113,29 @@ def test_steps_larger_than_any_recorded_motion_are_refused(drawn: Draws) -> None
     found = verify(pi(), {"family": with_draws(small)}, make_requirements(ASKED))
     notes = {v.requirement.metric: v.note for v in found.failed}
     assert "steps of 10 deg, the recordings move 4.58 deg; record larger motions" in notes["sim.overshoot_pct"]
+
+
+def test_some_draws_step_as_they_do_among_all_and_oscillate_beyond_their_margin(drawn: Draws) -> None:
+    asked = make_requirements(ASKED)
+    count = _draws.SEARCH_DRAWS + COUNT
+    weights = np.repeat(drawn.arrays["weights"][:1], count, axis=0)
+    weights[1] *= 2.0
+    draws = replace(drawn, arrays={"weights": weights})
+    where: Any = {"order": "sequential", "observer": None}
+    some = run_steps_on_draws("f", draws, pi().block(), asked, numbers=(1, 0), **where)
+    task = _drawn._task_of("f", draws, pi().block(), asked, "sequential", None, 0)
+    for k, number in enumerate((1, 0)):
+        alone = {name: max(value for value, _ in found) for name, found in _drawn._steps(task, number).items()}
+        assert {name: values[k] for name, values in some.items()} == alone
+    # A draw of twice the gain has half the margin.
+    case = _drawn._margins(replace(task, limits={"axes.gain_margin": 1.5}, amplitudes=task.amplitudes[-1:]), 1)[0]
+    experiment = replace(case.experiment, axes="both", what="gain_up")
+    margin = bisect(experiment, 1.0, 8.0, case.floor)
+    shares = [
+        oscillating_share("f", draws, pi().block(), asked, numbers=(0, 1), gain=gain, **where)
+        for gain in (0.9 * margin, 1.1 * margin)
+    ]
+    assert shares == [0.0, 0.5]
 
 
 def test_attempts_over_a_family_are_counted_from_the_certificates_of_a_folder(tmp_path: Path) -> None:

@@ -176,7 +176,8 @@ def test_a_family_that_cannot_be_made_is_done_without_and_none_of_other_recordin
         for path in others:
             path.touch()
         beside = next(_plan._controller(Options(logs=())))
-        assert beside.command[2:6] == (_plan.FAMILY, f"models/{second}", "--kinds", "pi,pid,fopi,hinf,lqg")
+        kinds = "pi,hinf" if draws else "pi,pid,fopi,hinf,lqg"
+        assert beside.command[2:6] == (_plan.FAMILY, f"models/{second}", "--kinds", kinds)
         plant = beside.beside[0].command[2]
         assert plant == ("models/auto_nonlinear.npz" if other == "nonlinear" else "models/auto.npz")
         for path in others:
