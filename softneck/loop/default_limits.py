@@ -20,6 +20,8 @@ TUNE = {
     "sim.steady_rms_deg": 0.15,
     "track.ahead_rms_deg": 1.5,  # distance with the preview that is best for all plants
 }
+#: How far [%] a search beside draws stays below its limit of overshoot, for draws that it does not see.
+UNSEEN_OVERSHOOT_PCT = 1.0
 #: Of `softneck verify`: `step` on the worst plant of the box with noise, `neck` on necks that differ from the preset.
 VERIFY = {
     "step.overshoot_pct": 15.0,

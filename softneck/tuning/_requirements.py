@@ -36,7 +36,7 @@ from softneck.verification import (
 
 _RISE_METRIC = "sim.rise_s"
 # How far a search stays within limits, beside its reserve, for draws that it does not see.
-_UNSEEN = {"axes.gain_margin": 0.2, "sim.overshoot_pct": 1.0}
+_UNSEEN = {"axes.gain_margin": 0.2, "sim.overshoot_pct": default_limits.UNSEEN_OVERSHOOT_PCT}
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 # Minimum, maximum and unit of the numbers of [track].
 _TRACK_NUMBERS = {

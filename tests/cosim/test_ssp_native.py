@@ -139,7 +139,7 @@ def _ports(block: Block) -> tuple[Port, ...]:
     [
         (lambda facts: facts.pop("module_of_runtime"), "made by another version of softneck"),
         (lambda facts: facts.update(runtime="softneck_0"), "made by another version of softneck"),
-        (lambda facts: facts.update(module_of_runtime="this"), "not in the table"),
+        (lambda facts: facts.update(module_of_runtime="this"), "cannot be in a compiled FMU"),
     ],
 )
 def test_a_python_fmu_that_cannot_be_made_again_is_refused(change: Any, message: str, tmp_path: Path) -> None:

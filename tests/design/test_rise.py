@@ -190,5 +190,5 @@ def test_a_lead_is_of_a_filter_that_is_given(kind: str) -> None:
     for given in ([0.0, 1.0], [None, 1.0]):
         with pytest.raises(SettingsError, match="needs a T2 above 0"):
             resolve(KINDS[kind].settings)(reference_time=given)
-    with pytest.raises(SettingsError, match=r"T2 \[s\], or \[T2, lead\]"):
+    with pytest.raises(SettingsError, match=r"T2 \[s\], \[T2, lead\] or"):
         resolve(KINDS[kind].settings)(reference_time=[0.1])
