@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,16 +13,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from softneck.core import SettingsError
+from softneck.core import SettingsError, to_si
 from softneck.design import HinfSettings, LqgSettings, PidSettings, PiSettings
 from softneck.design.linear import _feedforward
 from softneck.design.linear._axis_loop import axis_margins, make_sweep
 from softneck.design.linear._controller import AxisController, ReferenceFilter
 from softneck.design.linear._feedforward import follow_large_moves, follow_model
+from softneck.design.linear._ports import motor_ranges
 from softneck.design.plants._uncertain import StepAndLoad, uncertain_plant
 from softneck.estimation import AxisPlant
+from softneck.robot import Robot
 
 from ..verification.necks import TS, linear_neck, small_draws
+from .test_robots import plant as plant_of
 
 KINDS = {"pi": PiSettings, "pid": PidSettings, "hinf": HinfSettings, "lqg": LqgSettings}
 # A lag of 0.2 s with four samples of dead time, and one of two poles and a zero, both with the neck's gain.
@@ -103,6 +107,8 @@ def test_a_lag_with_dead_time_is_found_exactly() -> None:
     assert (found.static_gain, found.time_constant) == pytest.approx((0.09, plant.time_constant), rel=1e-4)
     with pytest.raises(SettingsError, match="leave the feedforward of `reference_time` out"):
         _feedforward._fit_plant(u, -y, plant)
+    with pytest.raises(SettingsError, match="leave the feedforward of `reference_time` out"):
+        _feedforward._fit_plant(u, 0.0 * y, plant)
 
 
 @pytest.mark.parametrize("given", [[0.1], [0.1, 1.0, 1.0, 1.0], [0.1, 1.0, -0.1], [0.1, 1.0, 11.0], [0.0, 0.0, 1.0]])
@@ -118,3 +124,44 @@ def test_feedforward_is_told_and_leaves_the_margins() -> None:
     for name, value in plain.design["pitch"]["margins"].items():
         # Its poles are of larger matrices: rounding.
         assert led.design["pitch"]["margins"][name] == pytest.approx(value, rel=1e-6)
+
+
+@pytest.mark.parametrize("large", [False, True])
+@pytest.mark.parametrize("name", ["neck", "antagonist", "finger"])
+def test_steps_go_up_and_down_from_the_recorded_posture_within_the_motors_limits(name: str, large: bool) -> None:
+    robot = Robot.preset(name)
+    model, told = plant_of(robot), []
+    low, high = motor_ranges(robot, None) or (np.zeros(1), np.ones(1))
+    common = float((0.3 * low + 0.7 * high).mean())
+    uncertain = uncertain_plant(model)
+    T, inverse = uncertain.redefinition
+
+    def simulate(steps: Any) -> np.ndarray:
+        told.append(steps)
+        return steps.set_points @ T[:-1].T + 5.0
+
+    conditions = {"motion": [1.0], "cocontraction": [common - 0.1, common + 0.1]}
+    draws: Any = SimpleNamespace(conditions=conditions, model=SimpleNamespace(simulate=simulate))
+    limits = PiSettings().of_robot(uncertain).limits(robot)
+    size = (4.0 if large else 0.2) * float((high - low).max())
+    k = len(uncertain.names) - 1
+    u, y = _feedforward._steps(uncertain, draws, limits, k, size)
+    # A plant that is its input: nothing but the posture is taken away.
+    np.testing.assert_allclose(u, y, atol=1e-9 * np.abs(u).max())
+    [steps] = told
+    up, down = (steps.set_points[steps.run == number] for number in (1, 2))
+    rest = (
+        0.5 * (low + high) if robot.motors.rest is None else to_si(robot.motors.unit)[0] * np.array(robot.motors.rest)
+    )
+    if inverse[:, -1].any():  # its motors pull together as they did in the recording
+        assert up[0].mean() == pytest.approx(common, rel=1e-9)
+        rest = rest + inverse[:, -1] * (common - rest.mean())
+    np.testing.assert_allclose(up[0], np.clip(rest, low, high), rtol=1e-9)
+    np.testing.assert_array_equal(up[: len(up) // 2], np.repeat(up[:1], len(up) // 2, axis=0))
+    assert ((steps.set_points >= low) & (steps.set_points <= high)).all()
+    moved = np.abs(np.diff(up, axis=0)).max()
+    if not large:
+        np.testing.assert_allclose(u[1], -u[0], atol=1e-9 * np.abs(u).max())
+        assert u[0, -1] == pytest.approx(size, rel=1e-9)
+        np.testing.assert_allclose(up + down, 2.0 * up[0] + 0.0 * up, rtol=1e-9)
+    assert moved <= limits.slew_limit * uncertain.sample_time * (1.0 + 1e-9)
