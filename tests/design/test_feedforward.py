@@ -150,6 +150,8 @@ def test_steps_go_up_and_down_from_the_recorded_posture_within_the_motors_limits
     np.testing.assert_allclose(u, y, atol=1e-9 * np.abs(u).max())
     [steps] = told
     up, down = (steps.set_points[steps.run == number] for number in (1, 2))
+    # Two seconds of a neck before and after, for others as much longer as they are slower.
+    assert len(up) == len(down) == 2 * round(2.0 * uncertain.axes[uncertain.names[k]].nominal.second / TS)
     rest = (
         0.5 * (low + high) if robot.motors.rest is None else to_si(robot.motors.unit)[0] * np.array(robot.motors.rest)
     )
