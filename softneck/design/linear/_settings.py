@@ -130,8 +130,8 @@ def reference_numbers(given: Any) -> tuple[float | None, float, float]:
     time, lead, feedforward = numbers if len(numbers) == 3 else [*numbers, 0.0]
     if time is not None:
         require_between("reference_time", time, 0.0, 1e6, "s")
-    require_between("the lead of `reference_time`", lead, 0.0, 10.0)
-    require_between("the feedforward of `reference_time`", feedforward, 0.0, 10.0)
+    require_between("lead of reference_time", lead, 0.0, 10.0)
+    require_between("feedforward of reference_time", feedforward, 0.0, 10.0)
     if lead + feedforward > 0.0 and not time:
         raise SettingsError("a `reference_time` of [T2, lead] needs a T2 above 0.")
     return time, lead, feedforward
