@@ -236,8 +236,6 @@ def holds_with_observer(task: Task, item: Candidate, observer: Any, bounds: tupl
     except SoftneckError:
         return False
     named = {f"sim.{task.asked.certificate.scale.name_of(name)}": value for name, value in worst.items()}
-    if not named:  # draws alone
-        return bool(task.drawn)
-    if not named["sim.rise_s"] <= item.metrics.get("sim.rise_s", math.inf):
+    if not named or not named["sim.rise_s"] <= item.metrics.get("sim.rise_s", math.inf):
         return False
     return all(ratio(b, named[b.metric]) <= 1.0 for b in bounds if b.metric in named)
