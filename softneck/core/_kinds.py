@@ -118,7 +118,7 @@ REMOVED: dict[str, str] = {
     "subspace": "rls --set structure=mimo",
     "nss": "guarded --set of=nn` or `greybox",
     "rls_state": "Recursion in Python",
-    "rls_online": "OnlineRls in Python",
+    "rls_online": "Recursion in Python",
     "frf": "softneck.frequency_response in Python",
 }
 _LAST_VERSION = "0.2.0"  # reads files of the kinds above

@@ -1,7 +1,6 @@
 from ._identify import family as family
 from ._identify import identify as identify
 from .linear._oe import OutputError as OutputError
-from .linear._rls import OnlineRls as OnlineRls
 from .linear._rls import Recursion as Recursion
 from .linear._rls import Rls as Rls
 from .models._drive import fit_drive as fit_drive

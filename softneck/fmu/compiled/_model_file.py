@@ -47,10 +47,7 @@ def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
     outer, _, inner = runtime.partition("(")
     pairs = [part.rpartition(":") for part in split_members(inner[:-1])] if inner else []
     if outer.startswith(PREFIX):
-        raise SettingsError(
-            "a Python object cannot be in a compiled FMU; use `--backend python`, or write its `step` as a module of "
-            "functions for `softneck.design.OwnController`, which runs compiled in loops."
-        )
+        raise SettingsError("a Python object cannot be in a compiled FMU; use `--backend python`.")
     runs = module_of(outer)
     if not is_known(runs):
         kind = outer.rpartition(".")[2].partition("@")[0].strip("_").removesuffix("_runtime")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,9 +23,9 @@ from softneck.core import (
     silent,
 )
 from softneck.runtime import load_functions
-from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
+from softneck.signals import Recording
 
-from ..models._drive import DriveModel, fit_drive
+from ..models._drive import fit_drive
 from ..models._fitting import MAX_DELAY, ScaledData, delay_samples, free_run_fit, training_recording
 from ..models._linear_systems import lss_arrays, varx_system
 from ..models._model import WARM_UP, Model
@@ -212,12 +212,6 @@ class Rls:
         if self.stable and self.structure == "mimo":
             raise SettingsError("`stable` watches the poles of one output; use structure `siso` or `miso` with it.")
 
-    def recursion(self) -> Recursion:
-        """Return the recursion of one output, for use sample by sample."""
-        inputs = {"siso": 1, "miso": 3, "mimo": 3}[self.structure]  # of a neck
-        outputs = 2 if self.structure == "mimo" else 1
-        return self._recursion(outputs * self.na + inputs * self.nb)
-
     def _recursion(self, parameters: int) -> Recursion:
         return Recursion(
             parameters=parameters,
@@ -373,92 +367,3 @@ def _simulation_fits(model: Model, recording: Recording) -> list[float]:
     simulated = model.simulate(recording)
     starts = np.concatenate([np.arange(len(run)) for run in recording.runs()]) >= WARM_UP
     return [nrmse_fit(recording.outputs[starts, axis], simulated[starts, axis]) for axis in axes]
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class OnlineState:
-    """State of `OnlineRls`: recursions of pitch and roll, and the last samples, newest first, NaN where missed.
-
-    inputs: (delay + nb, 3) set-points; outputs: (na, 2) angles.
-    """
-
-    recursions: tuple[RecursionState, RecursionState]
-    inputs: Matrix
-    outputs: Matrix
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OnlineRls:
-    """`Rls` sample by sample, with the same result as `Rls.fit` after as many rows.
-
-    Attributes:
-        settings: with a dead time given.
-        sample_time: [s].
-    """
-
-    settings: Rls
-    sample_time: float
-
-    def __post_init__(self) -> None:
-        require_positive("sample_time", self.sample_time, "s")
-        if self.settings.delay is None:
-            raise SettingsError(
-                "a dead time cannot be searched for sample by sample; give `delay`, from a model identified before."
-            )
-
-    @property
-    def delay(self) -> int:
-        """Dead time in samples."""
-        return round((self.settings.delay or 0.0) / self.sample_time)
-
-    def initial_state(self) -> OnlineState:
-        """Return the state before the first sample."""
-        recursion = self.settings.recursion()
-        return OnlineState(
-            recursions=(recursion.initial_state(), recursion.initial_state()),
-            inputs=np.full((self.delay + self.settings.nb, 3), np.nan),
-            outputs=np.full((self.settings.na, 2), np.nan),
-        )
-
-    def step(self, state: OnlineState, set_points: ArrayLike, measured: ArrayLike) -> OnlineState:
-        """Update by set-points (3,) from t_k on and pitch and roll (2,) [rad] measured at t_k; NaN where missed."""
-        u = finite_vector("set_points", set_points, 3)
-        y = np.asarray(measured, dtype=np.float64).ravel()
-        if y.size != 2:
-            raise DataError(f"`measured` must have 2 entries (pitch, roll); got {y.size}.")
-        recursion = self.settings.recursion()
-        first, second = (
-            recursion.step(state.recursions[axis], self._regressor(state, axis), float(y[axis])) for axis in range(2)
-        )
-        return OnlineState(
-            recursions=(first, second),
-            inputs=np.vstack([u, state.inputs[:-1]]),
-            outputs=np.vstack([y, state.outputs[:-1]]),
-        )
-
-    def model(self, state: OnlineState) -> Model:
-        """Return the present model, as `Rls.fit` does; its drives follow their set-points."""
-        thetas = [recursion.theta for recursion in state.recursions]
-        drive, s, delays = DriveModel(np.zeros(3), np.zeros(3)), self.settings, [self.delay, self.delay]
-        if s.structure == "siso":
-            a, b = np.split(np.array(thetas), [s.na], axis=1)
-            arrays = axis_arrays(redefinition_matrix(TENDON_ANGLES), drive, a, b, delays)
-        else:
-            arrays = motor_arrays(s, thetas, delays, drive.array)
-        stds = [recursion.parameter_std.tolist() for recursion in state.recursions]
-        return Model(
-            kind="rls",
-            sample_time=self.sample_time,
-            arrays=arrays,
-            settings=asdict(s),
-            findings={"parameter_std": stds} if np.isfinite(stds).all() else {},
-        )
-
-    def _regressor(self, state: OnlineState, axis: int) -> Vector:
-        """Return phi(t-1) of Eq. 26 for one axis."""
-        acting = state.inputs[self.delay :]
-        own, other = -state.outputs[:, axis], -state.outputs[:, 1 - axis]
-        if self.settings.structure == "siso":
-            return np.concatenate([own, acting @ redefinition_matrix(TENDON_ANGLES)[axis]])
-        pasts = [own, other] if self.settings.structure == "mimo" else [own]
-        return np.concatenate([*pasts, acting.T.ravel()])
