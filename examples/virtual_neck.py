@@ -1,4 +1,4 @@
-"""The virtual neck: a step, its hysteresis loop and its slack tendons as figures, and the neck in 3-D.
+"""The virtual neck: a step, its hysteresis loop and its slack tendons as figures.
 
 Run `python examples/virtual_neck.py`; the pictures go to `build/virtual_neck`.
 """
@@ -12,7 +12,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.plots import neck_view, write_page
 from softneck.signals import SAMPLE_TIME, Excitation, redefine, signal
 
 OUT = Path("build/virtual_neck")
@@ -69,9 +68,7 @@ def main() -> None:
     step_figure()
     hysteresis_figure()
     slack_figure()
-    rotation = record(signal("rotation"), NECK, seed=1)
-    write_page(OUT / "neck.html", neck_view(rotation, title="Test 3 on the virtual neck"), force=True)
-    print(f"step.svg, hysteresis.svg, slack.svg and neck.html are in {OUT}")
+    print(f"step.svg, hysteresis.svg and slack.svg are in {OUT}")
 
 
 if __name__ == "__main__":

@@ -164,7 +164,7 @@ def _refuse_foreign(folder: Path, *, force: bool) -> None:
 def _print(demo: Demo) -> None:
     from softneck.report import FIT_HEAD, FIT_NOTE, fit_rows, fmu_rows, loop_rows
 
-    print_table("Models, ours beside the paper's (fit in %, pitch/roll)", FIT_HEAD, fit_rows(demo.judged, demo.rough))
+    print_table("Models, ours beside the paper's (fit in %, pitch/roll)", FIT_HEAD, fit_rows(demo.judged))
     click.echo(FIT_NOTE + "\n")
     print_table("FMUs in fmpy against the Python models, in simulation", *fmu_rows(demo.packaged))
     print_table("Closed loops over FMUs against the virtual neck", *loop_rows(demo.loops))

@@ -38,9 +38,7 @@ _WORST_RUNS = 3
     type=click.Path(path_type=Path),
     help="Write a certificate of the limits that held, with the hashes of all files; `drives run` asks for it.",
 )
-@click.option(
-    "--html", type=click.Path(path_type=Path), help="Write a page with plots, and beside it the robot in 3-D."
-)
+@click.option("--html", type=click.Path(path_type=Path), help="Write a page that plays the run.")
 @click.option(
     "--step",
     type=click.FloatRange(min=0.0, min_open=True),
@@ -85,13 +83,6 @@ def command(
         if loop_file.suffix != ".ssp":
             cosim.require_trusted(loop_file, trust=trust)
         setup = cosim.load_loop(loop_file, robot=robot)
-    view = (
-        html.with_name(f"{html.stem}_3d.html")
-        if html is not None and not plots.why_not_drawn(setup.loop.robot)
-        else None
-    )
-    if view is not None:
-        refuse_existing(view, force=force)
     if certificate is not None and not setup.limits:
         from softneck.loop.default_limits import LOOP
 
@@ -109,10 +100,8 @@ def command(
     signals.write_recording(path, result.recording(), force=replace)
     if certificate is not None:
         write_certificate(certificate, result.certificate(), force=force)
-    if view is not None:
-        plots.write_page(view, plots.neck_view(result.recording(), title=f"Loop {loop_file.stem}"), force=force)
     if html is not None:
-        plots.write_page(html, loop_page(loop_file.stem, result, faults=faults, view=view), force=force)
+        plots.write_page(html, loop_page(loop_file.stem, result, faults=faults), force=force)
     if as_json:
         print_json({**result.report(), "faults": faults, "decision": loop_decision(result.limits)})
     else:

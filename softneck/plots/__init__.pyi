@@ -5,7 +5,6 @@ from ._chart import Panel as Panel
 from ._chart import chart_figure as chart_figure
 from ._charts import pareto_figure as pareto_figure
 from ._charts import validation_figure as validation_figure
-from ._neck3d import neck_view as neck_view
 from ._page import Section as Section
 from ._page import Table as Table
 from ._page import page as page
@@ -30,7 +29,6 @@ from ._charts import pareto_chart as pareto_chart
 from ._charts import recording_chart as recording_chart
 from ._charts import residual_chart as residual_chart
 from ._charts import validation_chart as validation_chart
-from ._neck3d import why_not_drawn as why_not_drawn
 from ._page import Script as Script
 from ._page import cell as cell
 from ._recording_pages import import_page as import_page

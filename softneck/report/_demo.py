@@ -12,7 +12,7 @@ import numpy as np
 
 from softneck.core import OutputFileError, SettingsError, atomic_write
 from softneck.cosim import Result
-from softneck.identification import INFINITE, Model, Validation
+from softneck.identification import INFINITE, Model
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plots import (
     Chart,
@@ -20,7 +20,6 @@ from softneck.plots import (
     Table,
     cell,
     loop_chart,
-    neck_view,
     page,
     recording_chart,
     validation_chart,
@@ -42,7 +41,6 @@ from ._demo_steps import (
     limits_of,
     package,
     record_experiments,
-    validate_on_rough,
 )
 from ._reproduce import FREE_RUN, FREE_RUN_MEASURED, ONE_STEP
 
@@ -78,13 +76,12 @@ class DemoSettings:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Demo:
-    """Results of the demo; `rough` holds simulations of models identified anew on the preset `rough`."""
+    """Results of the demo."""
 
     settings: DemoSettings
     experiments: Experiments
     models: Mapping[str, Model]
     judged: Mapping[tuple[str, str], ValidationPair]
-    rough: Mapping[tuple[str, str], Validation]
     packaged: Mapping[str, PackagedFmu]
     designed: DemoDesign
     loops: Mapping[str, Result]
@@ -102,7 +99,6 @@ class Demo:
                 result.free.as_dict() | {"free_run_measured_motors": result.measured.fits[INFINITE]}
                 for result in self.judged.values()
             ],
-            "models_on_rough": [result.as_dict() for result in self.rough.values()],
             "fmus": {
                 name: {"fmu": str(item.path), "rows": item.rows, "max_difference": item.difference, "holds": item.equal}
                 for name, item in self.packaged.items()
@@ -135,7 +131,6 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
     for name, model in models.items():
         model.save(out / "models" / f"{name}.npz", force=True)
     judged = judge(models, experiments, tell=tell)
-    rough = validate_on_rough(duration=settings.duration, tell=tell)
     plants = {**models, "virtual_neck": VirtualNeck(neck)}
     compared = experiments.tests["rotation"].rows(0, settings.compare_rows)
     scores = {name: score_line(judged, name) for name in models}
@@ -145,12 +140,9 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
     designed.observer.save(out / "models" / "kalman.npz", force=True)
     loops = close_loops(out / "loops", sample_time=models["rls"].sample_time, tell=tell)
     for name, result in loops.items():
-        recording = result.recording()
-        write_recording(out / "results" / f"{name}.csv", recording, force=True)
-        view = neck_view(recording, title=f"The neck in the loop {to_words(name)}")
-        write_page(out / "results" / f"{name}_3d.html", view, force=True)
+        write_recording(out / "results" / f"{name}.csv", result.recording(), force=True)
     demo = Demo(
-        settings=settings, experiments=experiments, models=models, judged=judged, rough=rough, packaged=packaged,
+        settings=settings, experiments=experiments, models=models, judged=judged, packaged=packaged,
         designed=designed, loops=loops, seconds=0.0,
     )  # fmt: skip
     _write_results(demo, tell)
@@ -173,7 +165,7 @@ def _write_results(demo: Demo, tell: Tell) -> None:
 Rows = list[list[str]]
 FIT_HEAD = [
     "model on data", "persistence", "one step", "paper, one step", "simulation", "paper, simulation",
-    "simulation, measured motors", "paper, same", "simulation on rough",
+    "simulation, measured motors", "paper, same",
 ]  # fmt: skip
 FIT_NOTE = (
     "Fit 100 (1 - |y - yhat| / |y - mean y|) in %, pitch/roll. Persistence repeats the last sample; a one-step fit is "
@@ -181,12 +173,11 @@ FIT_NOTE = (
     "paper's SM and NN figures of Tables 3 and 4 are one step ahead, its RLS figures simulations; its section 7.4 is "
     "simulation with measured motors. The paper's plant is the real neck, ours the virtual one. nlsm is set membership "
     "over the paper's Eq. 21. nlsm_residual, which the paper does not have, is set membership on the residual of the "
-    "simulation of rls; it has no feedback, so it cannot drift. The last column is identified anew on the preset "
-    "rough, which a linear model follows no better than the paper's neck."
+    "simulation of rls; it has no feedback, so it cannot drift."
 )
 
 
-def fit_rows(judged: Mapping[tuple[str, str], ValidationPair], rough: Mapping[tuple[str, str], Validation]) -> Rows:
+def fit_rows(judged: Mapping[tuple[str, str], ValidationPair]) -> Rows:
     """Return one row for each model and recording."""
     rows = []
     for (model, data), result in judged.items():
@@ -201,7 +192,6 @@ def fit_rows(judged: Mapping[tuple[str, str], ValidationPair], rough: Mapping[tu
                 _paper_cell(FREE_RUN.get(key)),
                 cell(result.measured.fits[INFINITE], ".1f"),
                 _paper_cell(FREE_RUN_MEASURED.get(key)),
-                cell(rough[key].fits[INFINITE], ".1f") if key in rough else "",
             ]
         )
     return rows
@@ -289,7 +279,7 @@ def _overview(demo: Demo, first: str) -> Section:
 def _fits(demo: Demo) -> Section:
     quick = "This is the quick form: the experiment is shorter than the paper's and the training less."
     method = [*([quick] if demo.settings.duration < FULL_DURATION else []), FIT_NOTE]
-    table = Table("Models, ours beside the paper's", FIT_HEAD, fit_rows(demo.judged, demo.rough))
+    table = Table("Models, ours beside the paper's", FIT_HEAD, fit_rows(demo.judged))
     return Section("Models", charts=_validation_section(_FIRST_TEST, demo).charts[:1], method=method, tables=[table])
 
 

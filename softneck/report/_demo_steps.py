@@ -73,26 +73,6 @@ def identify(recording: Recording, *, iterations: int, seed: int, tell: Tell) ->
     return {name: estimator.fit(recording, progress=tell(f"identify {name}")) for name, estimator in estimators.items()}
 
 
-def validate_on_rough(*, duration: float, tell: Tell) -> dict[tuple[str, str], Validation]:
-    """Identify rls and residual set membership on the preset `rough`, and validate their simulations there.
-
-    A linear model follows `rough` no better than the paper's neck.
-    """
-    experiments = record_experiments(
-        NeckParameters.rough(), duration=duration, tell=lambda text: tell(f"{text}, preset rough")
-    )
-    estimators = {"rls": Rls(), "nlsm_residual": SetMembership(form="residual")}
-    models = {
-        name: estimator.fit(experiments.identification, progress=tell(f"identify {name}, preset rough"))
-        for name, estimator in estimators.items()
-    }
-    return {
-        (name, data): validate(model, recording, names=(name, data), horizons=(INFINITE,))
-        for name, model in models.items()
-        for data, recording in experiments.judged.items()
-    }
-
-
 def judge(
     models: Mapping[str, Model], experiments: Experiments, *, tell: Tell
 ) -> dict[tuple[str, str], ValidationPair]:

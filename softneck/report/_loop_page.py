@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
 from softneck.core import METRICS, metric_of, to_si
 from softneck.cosim import Result
@@ -23,7 +21,6 @@ from softneck.plots import (
     in_display_unit,
     loop_chart,
     page,
-    why_not_drawn,
 )
 
 # Positions of the slider; longer runs skip rows.
@@ -33,22 +30,18 @@ _PLAYED_S = (4.0, 30.0)
 _CURSOR = Level(0.0, colour="#3b7dd8", dashed=False, vertical=True)
 
 
-def loop_page(name: str, result: Result, *, faults: Sequence[Mapping[str, Any]] = (), view: Path | None = None) -> str:
-    """Return the HTML page of a simulated loop.
-
-    `faults`: as from `fault_values`. `view`: page of the robot in 3-D beside this one.
-    """
+def loop_page(name: str, result: Result, *, faults: Sequence[Mapping[str, Any]] = ()) -> str:
+    """Return the HTML page of a simulated loop; `faults` are as from `fault_values`."""
     time, robot = result.signals.time, result.robot
     chart = loop_chart(time, result.signals.signals, "Reference, outputs and motors", limits=result.bounds, robot=robot)
     values = player_values(result, chart, faults)
     chart = replace(chart, panels=[replace(panel, levels=(*panel.levels, _CURSOR)) for panel in chart.panels])
     what = "angle" if to_si(robot.outputs.unit)[1] == "rad" else "output"
-    method: list[str] = [
+    method = [
         "Play or move the slider: outputs and the upright line follow. The strip below it marks faults (purple), times "
         "of limits (black) and where an overshoot exceeds its limit (red).",
         f"Order {result.order}, metrics of the {result.angle} {what}, {result.real_time_factor:.0f} times real time.",
     ]
-    method.append(Markup('<a href="{}">The robot in 3-D</a>').format(view.name) if view else why_not_drawn(robot))
     tables = [Table("Metrics", ["metric", "value"], _metrics(result))]
     if result.limits:
         tables.insert(0, Table("Limits", ["metric", "value", "limit", "verdict"], _limits(result)))
@@ -130,7 +123,8 @@ def player_values(result: Result, chart: Chart, faults: Sequence[Mapping[str, An
                         "high": high, "reference": None if shown is None else _numbers(shown[every])})  # fmt: skip
     length = float(time[-1] - time[0]) if time.size > 1 else 1.0
     return {
-        "time": _numbers(time[every]), "outputs": outputs, "bends": not why_not_drawn(robot),
+        "time": _numbers(time[every]), "outputs": outputs,
+        "bends": robot.directions.kind == "tendons" and to_si(robot.outputs.unit)[1] == "rad",
         "marks": [*_fault_marks(faults, float(time[-1])), *_limit_marks(result, chart)],
         "pace": length / min(max(length, _PLAYED_S[0]), _PLAYED_S[1]),
     }  # fmt: skip

@@ -136,9 +136,6 @@ def test_the_page_of_a_loop_has_a_panel_for_each_output_in_its_unit(call: Call, 
     page = (tmp_path / "loop.html").read_text(encoding="utf-8")
     for label in ("x [mm]", "y [mm]", "z [mm]", "motor [bar]", "set-point d", "z.rms_error_mm", "the true output"):
         assert label in page + charts_of(page), label
-    # What tendons bend is what the 3-D view draws.
-    assert not (tmp_path / "loop_3d.html").exists()
-    assert "has no view in 3-D: only robots bent by tendons at known angles have one." in page
 
 
 @pytest.mark.slow
