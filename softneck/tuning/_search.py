@@ -96,8 +96,9 @@ class Candidate:
     def cost(self, bounds: Sequence[Requirement], *, tested: bool, aim: str = "") -> float:
         """Return the cost, at most 1 where all known requirements hold.
 
-        It is the largest ratio where all hold, or that of the metric `aim`, else 1 plus the sum of x/(1 + x/4) over the
-        excesses x beyond 1: an exact penalty (Nocedal and Wright 2006, sec. 17.2).
+        It is the largest ratio where all hold, else 1 plus the sum of x/(1 + x/4) over the excesses x beyond 1: an
+        exact penalty (Nocedal and Wright 2006, sec. 17.2). With `aim` it is the ratio of that metric where all hold,
+        and among equal ones the modulus margin 1/Ms decides.
         """
         each = self.ratios(bounds, tested=tested)
         found = list(each.values())
@@ -107,6 +108,9 @@ class Candidate:
         rest = _TIE_WEIGHT * float(np.mean([min(value, 1.0) for value in found]))
         if beyond > 0.0:
             return 1.0 + beyond + rest
+        if aim in each:
+            sensitivity = self.metrics.get("axes.sensitivity", math.inf)
+            rest = _TIE_WEIGHT * (1.0 - (1.0 / sensitivity if sensitivity > 0.0 else 0.0))
         return (1.0 - _TIE_WEIGHT) * each.get(aim, max(found)) + rest
 
     def holds(self, bounds: Sequence[Requirement], *, tested: bool) -> bool:

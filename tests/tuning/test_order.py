@@ -1037,6 +1037,21 @@ def test_once_all_requirements_hold_the_aim_alone_counts_and_no_failure_is_bough
     assert slow.cost(bounds, tested=False) < fast.cost(bounds, tested=False) < 1.0
 
 
+def test_of_equal_aims_the_larger_modulus_margin_wins_but_buys_no_aim() -> None:
+    bounds = (Requirement("m", "max", 1.0, True), Requirement("sim.rise_s", "max", 1.0, False))
+
+    def cost(rise: float, **sensitivity: float) -> float:
+        metrics = {"m": 0.2, "sim.rise_s": rise} | {f"axes.{name}": value for name, value in sensitivity.items()}
+        return Candidate("a", {}, np.zeros(1), "all", metrics).cost(bounds, tested=False, aim="sim.rise_s")
+
+    order = [cost(0.5, sensitivity=value) for value in (1.0, 1.65, 2.8, math.inf)]
+    assert order == sorted(set(order))
+    # An unknown one is the worst, and a number that is none too.
+    assert cost(0.5) == cost(0.5, sensitivity=math.nan) == order[-1]
+    # A rise of 3 % of its limit more, less than a sample's share of any default, is worth no margin.
+    assert cost(0.53, sensitivity=1.0) > order[-1]
+
+
 def test_of_two_starts_that_are_alike_the_one_at_its_limits_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     search = searching("ab", drawn=("d",))
     search.spaces = list(spaces(("pi", "mpc"), rise=0.5, cocontraction=None, robot=Robot.preset()))
