@@ -16,7 +16,7 @@ import scipy.optimize
 
 from softneck.core import SettingsError
 from softneck.design import PidSettings
-from softneck.design.linear import _pid, _settings
+from softneck.design.linear import _pi, _pid, _settings
 from softneck.design.linear._axis_loop import (
     LAG,
     check_rise,
@@ -140,6 +140,30 @@ def test_a_search_keeps_the_hardest_samples(monkeypatch: pytest.MonkeyPatch) -> 
     few: Any = _WorstCase.select_hardest(judge, GAINS)
     assert set(few.sweep.plants.tolist()) == {1.0, 2.0, 3.0}
     assert (few.sweep.delays - few.sweep.plants).tolist() == [10.0] * 3
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_largest_pi_keeps_both_bounds_at_every_size_up_to_it_and_none_beyond(seed: int) -> None:
+    """By the bounds themselves on a grid of sizes; the loops turn far enough to meet either bound first."""
+    rng = np.random.default_rng(seed)
+    w, angle = np.geomspace(0.05, 150.0, 200), rng.uniform(0.3, 1.4)
+    lag, delay = np.exp(rng.normal(-1.0, 0.5, (2, 2, 1)))
+    shape = np.exp(-0.3j * w * delay) / (1.0 + 1j * w * lag) * (1.0 + 1.0 / (1j * w * lag * rng.uniform(0.3, 3.0)))
+    limit = rng.uniform(1.1, 2.5)
+    largest = _pi._largest_size(shape, limit, angle)
+    assert all(_pi._keeps(size * shape, limit, angle) for size in np.geomspace(_pi._LEAST_SIZE, largest, 400))
+    # One part in a thousand, less than a step between two frequencies turns or grows the loop.
+    assert not _pi._keeps(1.001 * largest * shape, limit, angle)
+    # A further loop or a stricter bound never allows more.
+    assert _pi._largest_size(np.vstack([shape, 1.3 * shape[:1]]), limit, angle) <= largest
+    assert _pi._largest_size(shape, 0.95 * limit, angle) <= largest
+    assert _pi._largest_size(shape, limit, 1.05 * angle) <= largest
+
+
+def test_a_pi_whose_loop_meets_no_bound_ends_at_the_largest_size_and_one_that_always_does_has_none() -> None:
+    shape = np.full((1, 5), 1e-4 + 0.0j)
+    assert _pi._largest_size(shape, 1.5, 1.0) == pytest.approx(_pi._LARGEST_SIZE, rel=1e-8)
+    assert _pi._largest_size(-1e6 * shape, 1.5, 1.0) == 0.0
 
 
 # -- filters and conditioning -----------------------------------------------------------------------------------------

@@ -87,7 +87,7 @@ class PiSettings(AxisSettings):
         low, high = 0.0, 1.0
         if keeps(high):
             return gains
-        for _ in range(_REFINEMENT_STEPS + 4):
+        for _ in range(_REFINEMENT_STEPS):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if keeps(middle) else (low, middle)
         if low == 0.0:
@@ -127,9 +127,10 @@ class PiSettings(AxisSettings):
         return plant.samples[: 1 if faster is plant.nominal else 2]
 
 
-# Loop gains that are tried, in units of the plant's static gain, 5 % apart and refined to 0.1 % at the border.
-_SIZES = np.geomspace(1e-2, 1e2, 190)
-_REFINEMENT_STEPS = 6
+# Loop gains that are allowed, in units of the plant's static gain.
+_LEAST_SIZE, _LARGEST_SIZE = 1e-2, 1e2
+# Halvings in `_keep_exactly`: to 0.1 %.
+_REFINEMENT_STEPS = 10
 # Between its frequencies the grid misses this much of a well-damped peak.
 _GRID_TOLERANCE = 1.005
 # Integral times that are tried, in units of the plant's lag and delay together.
@@ -239,21 +240,18 @@ def open_loop(plant: AxisPlant, extra_delay: int, gains: Gains) -> control.Trans
 def _largest_size(shape: Matrix, max_sensitivity: float, phase_margin: float) -> float:
     """Return the largest size up to which all loops size * shape (plants, frequencies) keep both bounds, or 0.
 
-    A small loop around a stable plant is stable, and one that keeps Ms all the way up has never crossed -1;
-    a search by halves alone could end beyond the border of stability.
+    A small loop around a stable plant is stable, and one that keeps Ms all the way up has never crossed -1. The bound
+    on Ms, |1 + size L|^2 = 1/Ms^2, is a quadratic in the size; the phase margin breaks where |size L| falls through 1
+    within it.
     """
-    low = 0.0
-    for size in _SIZES:
-        if not _keeps(size * shape, max_sensitivity, phase_margin):
-            break
-        low = float(size)
-    else:
-        return low
-    high = float(size)
-    for _ in range(_REFINEMENT_STEPS if low > 0.0 else 0):
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if _keeps(middle * shape, max_sensitivity, phase_margin) else (low, middle)
-    return low
+    real, squared, rest = shape.real, shape.real**2 + shape.imag**2, 1.0 - max_sensitivity**-2
+    inside = real**2 - rest * squared
+    touch = (real < 0.0) & (inside >= 0.0)
+    sizes = rest / (np.sqrt(inside[touch]) - real[touch])
+    close = -real[:, 1:] > math.cos(phase_margin) * np.sqrt(squared[:, 1:])
+    fall = squared[:, :-1][close & (squared[:, :-1] > squared[:, 1:])]
+    size = min(sizes.min(initial=_LARGEST_SIZE), 1.0 / math.sqrt(fall.max(initial=_LARGEST_SIZE**-2)))
+    return (1.0 - 1e-9) * float(size) if size >= _LEAST_SIZE else 0.0  # rounding must not end beyond a bound
 
 
 def _keeps(loops: Matrix, max_sensitivity: float, phase_margin: float) -> bool:
