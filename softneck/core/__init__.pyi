@@ -35,8 +35,10 @@ from ._units import to_si as to_si
 from ._archive import is_archive as is_archive
 from ._archive import require_header as require_header
 from ._blas_threads import core_count as core_count
+from ._blas_threads import cores_taken as cores_taken
 from ._blas_threads import one_blas_thread as one_blas_thread
 from ._blas_threads import side_by_side as side_by_side
+from ._blas_threads import take_cores as take_cores
 from ._certificate import CERTIFICATE_ENDING as CERTIFICATE_ENDING
 from ._certificate import CERTIFICATE_KINDS as CERTIFICATE_KINDS
 from ._certificate import certificate_contents as certificate_contents

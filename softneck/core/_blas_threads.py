@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -78,6 +79,22 @@ def core_count() -> int:
 
 # Cores beside that of the caller: calls within calls share them, so that threads never outnumber cores.
 _FREE_CORES = threading.Semaphore(core_count() - 1)
+
+
+def take_cores(count: int) -> int:
+    """Take up to `count` free cores from `side_by_side`; return how many."""
+    return sum(_FREE_CORES.acquire(blocking=False) for _ in range(count))
+
+
+@contextmanager
+def cores_taken(count: int) -> Iterator[None]:
+    """Take up to `count` free cores from `side_by_side` while other processes work on them."""
+    taken = take_cores(count)
+    try:
+        yield
+    finally:
+        for _ in range(taken):
+            _FREE_CORES.release()
 
 
 def side_by_side(calls: Sequence[Callable[[], _Result]]) -> list[_Result]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -62,6 +62,7 @@ class RobotReference:
     at: float = 0.0
     rise: float = 1.0
     frequency: float = 0.2
+    repeats: ClassVar[bool] = True  # equal ones have equal samples: `run_loop` keeps them
 
     def __post_init__(self) -> None:
         require_one_of("kind", self.kind, tuple(SHAPES))

@@ -330,9 +330,7 @@ def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float
                 for group in (item.axis, "axes", *(("mimo",) if last == "disk_margin" else ())):
                     keep_worse(found, f"{group}.{last}", float(value))
             keep_worse(found, "robust.mu", item.mu)
-    steps = run_steps(
-        plants, judged_one.block, asked.step_test(task.seed), workers=1, robot=task.robot, weights=ready.weights
-    )
+    steps = run_steps(plants, judged_one.block, asked.step_test(task.seed), robot=task.robot, weights=ready.weights)
     names = {name: f"step.{asked.scale.name_of(name)}" for name in steps.metrics}
     return found | {names[name]: worst(name, values) for name, values in steps.metrics.items()}
 
@@ -469,7 +467,7 @@ def linear_curves(task: Task, ready: Ready, controller: Any) -> dict[str, list[f
     judged_one: ControllerUnderTest = controller_under_test(controller, order=None, observer=False)
     test = replace(task.asked.certificate.step_test(task.seed), noise=0.0, load=0.0)
     found = run_steps(
-        ready.plants.later(judged_one.extra), judged_one.block, test, workers=1, robot=task.robot, weights=ready.weights
+        ready.plants.later(judged_one.extra), judged_one.block, test, robot=task.robot, weights=ready.weights
     )
     shown, time = task.asked.certificate.scale.shown, curve_times(task)
     half = found.time.size // 2

@@ -15,15 +15,16 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from softneck.core import Progress, SoftneckError, worst
+from softneck.core import Progress, SoftneckError, cores_taken, worst
 from softneck.cosim import WorkerPool
 from softneck.verification import Requirement
 
-from ._judge import LEVELS, hardest_draws, judge_candidate
+from ._judge import LEVELS, hardest_draws, judge_candidate, prepare
 from ._space import COSTLY, Space
 from ._task import Job, Judgement, Log, Task
 
@@ -138,14 +139,15 @@ def ratio(item: Requirement, value: float) -> float:
 class Search:
     """A running search.
 
-    `task`: what is tuned. `spaces`: of the kinds. `crew`: workers. `log`: of judgements. `budget`: of judgements.
-    `report`: called with progress and the best so far. `finals`: number of final candidates with margins by experiment.
-    `earlier`: number of judgements of the search that this one resumes.
+    `task`: what is tuned. `spaces`: of the kinds. `workers`: processes beside this one. `log`: of judgements.
+    `budget`: of judgements. `report`: called with progress and the best so far. `finals`: number of final candidates
+    with margins by experiment. `earlier`: number of judgements of the search that this one resumes. `started`: done
+    when the workers have imported what they need.
     """
 
     task: Task
     spaces: list[Space]
-    crew: WorkerPool
+    workers: WorkerPool | None
     log: Log
     budget: int
     report: Progress
@@ -154,6 +156,7 @@ class Search:
     spent: set[Job] = field(default_factory=set)
     dropped: dict[str, str] = field(default_factory=dict)
     earlier: int = 0
+    started: Future | None = None
 
     @property
     def levels(self) -> Sequence[str]:
@@ -168,6 +171,8 @@ class Search:
         levels = self.levels
         # A small budget goes to the starts first.
         finals = min(self.finals, max(0, self.budget - len(levels) * len(self.spaces))) if self.task.own else 0
+        if self.workers is not None:
+            self.started = self.workers.pool.submit(prepare, self.task)
         alive, before = self._judge_starts(levels, finals, optimisers), -1
         while self._remaining(finals + round(_REFINED_SHARE * self.budget)) > 0 and alive and before < len(self.spent):
             before = len(self.spent)
@@ -338,15 +343,19 @@ class Search:
             judged = item.level == level or item.error or job in self.spent
             if not judged and len(wanted) < self._remaining(reserved):
                 wanted.setdefault(job, item)
-        run_jobs([job for job in wanted if job not in self.log.found], self._submit, self.crew, self._store)
+        run_jobs([job for job in wanted if job not in self.log.found], self._call, self._store, self._started_workers())
         for job, item in wanted.items():
             self.spent.add(job)
             item.update(level, self.log.found[job])
         self._report_progress()
 
-    def _submit(self, job: Job) -> Future:
+    def _started_workers(self) -> WorkerPool | None:
+        """Return the workers once they have started; until then this process does all."""
+        return self.workers if self.started is not None and self.started.done() else None
+
+    def _call(self, job: Job) -> Callable[[], Judgement]:
         item = self.candidates[(job.kind, job.settings)]
-        return self.crew.pool.submit(judge_candidate, self.task, job.kind, item.settings, job.level)
+        return partial(judge_candidate, self.task, job.kind, item.settings, job.level)
 
     def _store(self, job: Job, judgement: Judgement) -> None:
         self.log.found[job] = judgement
@@ -360,16 +369,21 @@ class Search:
 
 
 def run_jobs(
-    jobs: Sequence[Job], run: Callable[[Job], Future], crew: WorkerPool, took: Callable[[Job, Judgement], None]
-) -> None:
-    """Run jobs, two per worker at a time, and store each result when it arrives."""
+    jobs: Sequence[Job], call: Callable[[Job], Callable[[], Judgement]], took: Callable[[Job, Judgement], None],
+    workers: WorkerPool | None,
+) -> None:  # fmt: skip
+    """Run jobs, one here and two per worker at a time, and store each result when it arrives."""
     left, out = list(jobs)[::-1], dict[Future, Job]()
     try:
         while left or out:
-            while left and len(out) < 2 * crew.size:
+            while workers is not None and len(left) > 1 and len(out) < 2 * workers.size:
                 job = left.pop()
-                out[run(job)] = job
-            done, _ = wait(out, return_when=FIRST_COMPLETED)
+                out[workers.pool.submit(call(job))] = job
+            if left:
+                job = left.pop()
+                with cores_taken(len(out)):
+                    took(job, call(job)())
+            done, _ = wait(out, timeout=0.0 if left else None, return_when=FIRST_COMPLETED)
             for future in done:
                 took(out.pop(future), future.result())
     except BrokenExecutor as error:

@@ -12,6 +12,7 @@ from typing import Any
 from softneck.core import (
     Progress,
     SettingsError,
+    core_count,
     one_blas_thread,
     require_whole,
     shown_progress,
@@ -139,7 +140,7 @@ def tune(
         budget: number of judgements of candidates; 40 % more where draws of a family fail.
         observer: of the loop; default a Kalman filter over the nominal plant.
         seed: of the search and of the noise in its loops.
-        workers: processes; default one per core, 0 for this process.
+        workers: processes beside this one; default one for each further core.
         folder: of the log; the same call continues its search.
         force: replace another search in `folder`.
         files: role -> (path, SHA-256) of the files read, for the certificate.
@@ -178,8 +179,9 @@ def tune(
     prepare(task)  # report a plant that does not fit before the search
     log = Log(folder, task.digest, force=force)
     with shown_progress("tune", progress) as tell:
-        with open_workers(workers, None) as members:
-            search = Search(task, each, members, log, budget, lambda done, text: tell(0.9 * done, text))
+        beside = core_count() - 1 if workers is None else workers
+        with open_workers(beside, None) if beside else contextlib.nullcontext() as pool:
+            search = Search(task, each, pool, log, budget, lambda done, text: tell(0.9 * done, text))
             search.dropped |= dropped
             search.run()
             search, certified, tried = certify_search(search, files, lambda done, text: tell(0.9 + 0.1 * done, text))

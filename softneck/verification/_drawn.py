@@ -8,19 +8,19 @@ N = 59, 99 % for N = 299. At attempt k of several d is divided by k (Bonferroni)
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
 from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Progress, Vector, compute_once, worst
+from softneck.core import DataError, Progress, Vector, compute_once, side_by_side, worst
 from softneck.estimation import directions_of
 from softneck.identification import Draws, Model
 from softneck.loop import BlockPart, Loop, LoopResult, MotorFault, RobotReference, error_unit, run_loop, shows_settling
+from softneck.robot import Robot
 from softneck.runtime import Block
 
 from ._experiments import (
@@ -185,8 +185,7 @@ def run_steps_on_draws(
         return {metric: worst(metric, [value for value, _ in found]) for metric, found in _steps(task, number).items()}
 
     results = [one(numbers[0])]
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        results += list(pool.map(one, numbers[1:]))
+    results += side_by_side([partial(one, number) for number in numbers[1:]])
     return {metric: np.array([found[metric] for found in results]) for metric in results[0]}
 
 
@@ -197,16 +196,14 @@ def oscillating_share(
     """Return the share of these draws of a search that oscillate with all loop gains times or over `gain`."""
     task = _task_of(name, draws, controller, asked, order, observer, 0)
     task = replace(task, limits={_MARGINS[0]: gain}, amplitudes=task.amplitudes[-1:])
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        found = list(pool.map(lambda number: _margins(task, number, whole_only=True), numbers))
+    found = side_by_side([partial(_margins, task, number, whole_only=True) for number in numbers])
     return sum(any(item.oscillates for item in each) for each in found) / len(found)
 
 
 def _task_of(
     name: str, draws: Draws, controller: Block, asked: Requirements, order: str, observer: Block | None, attempt: int
 ) -> _Task:
-    models = _models(draws, attempt)
-    plants = [make_simulation_model(model, f"draw {k + 1} of {name}", asked.robot) for k, model in enumerate(models)]
+    plants = _plants(name, draws, attempt, asked.robot)
     inverse = asked.robot.redefinition(directions_of(draws.model))[1]
     return _Task(
         controller, asked, order, observer, draws, plants, _required_margins(asked), _amplitudes(draws, asked), inverse
@@ -229,8 +226,7 @@ def _run_all(
 
     # The first draw compiles the loop, once instead of in every thread.
     results = [one(0)]
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        results += list(pool.map(one, range(1, len(plants))))
+    results += side_by_side([partial(one, number) for number in range(1, len(plants))])
     failed = {item.number for _, margins in results for item in margins if item.oscillates}
     values: dict[str, list[float]] = {}
     conditions: dict[str, list[dict[str, Any]]] = {}
@@ -244,13 +240,12 @@ def _run_all(
                     failed.add(number)
     # A gain raised and one lowered are two margins: the slow loop of a lower gain swings longer, and may never fail.
     kinds = dict.fromkeys((item.metric, item.experiment.what) for _, margins in results for item in margins)
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        for metric, kind in kinds:
-            alike = [[m for m in margins if (m.metric, m.experiment.what) == (metric, kind)] for _, margins in results]
-            progress(0.95, f"bisect {metric}")
-            for value, item in pool.map(_least_margin, sorted(alike, key=_severity)[:_BISECTED]):
-                values.setdefault(metric, []).append(value)
-                conditions.setdefault(metric, []).append(_margin_facts(item, plants[item.number].name, asked))
+    for metric, kind in kinds:
+        alike = [[m for m in margins if (m.metric, m.experiment.what) == (metric, kind)] for _, margins in results]
+        progress(0.95, f"bisect {metric}")
+        for value, item in side_by_side([partial(_least_margin, m) for m in sorted(alike, key=_severity)[:_BISECTED]]):
+            values.setdefault(metric, []).append(value)
+            conditions.setdefault(metric, []).append(_margin_facts(item, plants[item.number].name, asked))
     return Drawn(
         name, draws, attempt, len(plants), {metric: np.array(found) for metric, found in values.items()}, conditions,
         tuple(sorted(failed)),
@@ -259,6 +254,16 @@ def _run_all(
 
 def _models(draws: Draws, attempt: int) -> list[Model]:
     return draws.for_certificate(attempt) if attempt else draws.for_search()
+
+
+def _plants(name: str, draws: Draws, attempt: int, robot: Robot) -> list[SimulationModel]:
+    """Return the draws as plants; every candidate of a search runs over the same."""
+
+    def make() -> list[SimulationModel]:
+        models = _models(draws, attempt)
+        return [make_simulation_model(model, f"draw {k + 1} of {name}", robot) for k, model in enumerate(models)]
+
+    return compute_once(make, name, draws, attempt, robot)
 
 
 def _required_margins(asked: Requirements) -> dict[str, float]:

@@ -9,17 +9,15 @@ Times and sizes are those of the neck, scaled to the robot; postures lie around 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
 
-from softneck.core import DataError, Progress, Vector, silent
+from softneck.core import DataError, Progress, Vector, side_by_side, silent
 from softneck.loop import BlockPart, Loop, LoopResult, Part, error_unit, run_loop
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
@@ -170,8 +168,7 @@ def crossings(
         least |= {
             kind: min(x.value for x in first if x.what == by) for by, led in _BOUNDED_SCANS.items() for kind in led
         }
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        return first + [found for part in pool.map(group, others) for found in part]
+    return first + [found for part in side_by_side([partial(group, job) for job in others]) for found in part]
 
 
 def _scan_group(loop: LoopUnderTest, axes: str, what: str, coarse: bool, least: float = math.inf) -> list[Crossing]:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector, to_si
+from softneck.core import Matrix, SettingsError, Vector, core_count, side_by_side, to_si
 from softneck.design import motor_ranges
 from softneck.loop import SETTLING_BAND, error_unit
 from softneck.robot import Robot
@@ -75,12 +74,11 @@ def check_ports(block: Block, robot: Robot) -> None:
 
 
 def run_steps(
-    plants: Plants, block: Block, test: StepTest, *, workers: int | None = None, robot: Robot | None = None,
-    weights: Matrix | None = None,
-) -> Steps:  # fmt: skip
+    plants: Plants, block: Block, test: StepTest, *, robot: Robot | None = None, weights: Matrix | None = None
+) -> Steps:
     """Return the responses of all plants, which include the delay of the loop's order, with a controller `block`.
 
-    `workers` None is one thread per core, `robot` None the neck, `weights` (axes, motors) None those of the robot.
+    `robot` None is the neck, `weights` (axes, motors) None those of the robot.
     """
     whose = Robot.preset() if robot is None else robot
     T = whose.redefinition(weights)[0]
@@ -103,7 +101,7 @@ def run_steps(
         # The plants are linear around that point.
         signals[:, 2 * m + 1 :] -= before[:m]
         signals[first + half :, 2 * m + 1 + axis] += test.load
-        y, P = _run(plants, block, signals, T, whose, workers or os.cpu_count() or 1)
+        y, P = _run(plants, block, signals, T, whose)
         y, P = y[:, first:], P[:, first:]
         angles.append(y[:, :, axis])
         other.append(np.delete(y[:, :half], axis, axis=2))
@@ -134,9 +132,7 @@ def middle_motors(robot: Robot, block: Block) -> Vector:
     return np.zeros(len(robot.set_points)) if ranges is None else 0.5 * (ranges[0] + ranges[1])
 
 
-def _run(
-    plants: Plants, block: Block, signals: Matrix, T: Matrix, robot: Robot, workers: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _run(plants: Plants, block: Block, signals: Matrix, T: Matrix, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     functions: Any = load_functions(f"{_SWEEP_RUNTIME}({block.runtime}:{len(block.arrays)})")
     axes, set_points = robot.outputs.names, robot.set_points
     arrays = (T, *block.arrays)
@@ -164,11 +160,10 @@ def _run(
                 plants.delay[chosen], mixed[chosen], signals, angles[chosen], motors[chosen],
             )  # fmt: skip
 
-    borders = np.linspace(0, n, min(workers, n) + 1).astype(int)
+    borders = np.linspace(0, n, min(core_count(), n) + 1).astype(int)
     # The first plant compiles; two threads compiling the same function would do it twice.
     part(slice(0, 1))
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(part, [slice(a, b) for a, b in pairwise(borders)]))
+    side_by_side([partial(part, slice(a, b)) for a, b in pairwise(borders)])
     return angles, motors
 
 

@@ -16,7 +16,7 @@ import scipy.linalg  # noqa: F401  (its BLAS is one of those that are counted)
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from softneck.core import _blas_threads
-from softneck.core._blas_threads import one_blas_thread, side_by_side
+from softneck.core._blas_threads import cores_taken, one_blas_thread, side_by_side, take_cores
 from softneck.core._kinds import KINDS, kinds_of, make_settings, resolve
 from softneck.identification import FamilySettings
 from softneck.identification.selection._auto import choose
@@ -169,4 +169,17 @@ def test_an_error_side_by_side_ends_what_has_not_begun(free: threading.Semaphore
     with pytest.raises(_AskedError, match=str(wrong)):
         side_by_side([partial(run, number) for number in range(100)])
     assert len(begun) < 100
+    assert _count(free) == 2
+
+
+@pytest.mark.parametrize("count", range(4))
+def test_cores_that_processes_take_are_free_again_afterwards(free: threading.Semaphore, count: int) -> None:
+    here = threading.current_thread()
+    with pytest.raises(_AskedError), cores_taken(count):  # noqa: PT012
+        with cores_taken(3):
+            assert {id(one) for one in side_by_side([threading.current_thread] * 9)} == {id(here)}
+        assert take_cores(3) == max(0, 2 - count)
+        if count < 2:
+            free.release(2 - count)
+        raise _AskedError
     assert _count(free) == 2

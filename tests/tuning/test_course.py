@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.cosim.studies._run_study import SameProcess, WorkerPool
 from softneck.estimation import KalmanSettings
 from softneck.robot import Robot
 from softneck.tuning import _certify, _search, _tune, tune
@@ -48,7 +47,7 @@ def searched(monkeypatch: pytest.MonkeyPatch, budget: int, tested: bool = True, 
         drawn=(),
     )  # fmt: skip
     each = spaces(("pi", "hinf"), rise=0.4, cocontraction=None, robot=Robot.preset())
-    found = Search(task, each, WorkerPool(1, SameProcess()), Log(None, ""), budget, tell)
+    found = Search(task, each, None, Log(None, ""), budget, tell)
     found.run()
     return found
 

@@ -205,7 +205,7 @@ def test_linear_checks_are_of_plants_as_late_as_the_loop_and_of_the_data_where_n
     task = _task()
     task.drawn, task.linear = drawn, {"f": 1}
     assert linear_metrics(task, SimpleNamespace(plants=plants, weights="W"), "c") == {}  # pyright: ignore[reportArgumentType]
-    assert named == [(("c",), ALONE), {"workers": 1, "robot": task.robot, "weights": "W"}]
+    assert named == [(("c",), ALONE), {"robot": task.robot, "weights": "W"}]
     by_data = [] if drawn else [({"f": 1}, "law", AXES, extra, -1.0)]
     assert [given for given in asked if given[0] == {"f": 1}] == by_data
     linear = [given for given in asked if given[0] != {"f": 1}]
@@ -677,7 +677,7 @@ def test_linear_curves_are_of_the_first_output_with_the_nominal_plant_last(monke
     def run(plants: Any, block: Any, test: Any, **more: Any) -> Any:
         tests.append(test)
         assert (plants, block) == (("later", 1), "block")
-        assert more == {"workers": 1, "robot": task.robot, "weights": None}
+        assert more == {"robot": task.robot, "weights": None}
         return SimpleNamespace(time=t, angles=y, motors=P)
 
     def alone(controller: Any, **more: Any) -> Any:
@@ -932,7 +932,7 @@ def test_nothing_is_judged_twice_nor_after_an_error_nor_beyond_the_budget(
     search.spent = {jobs["e"]}
     found[jobs["f"]] = Judgement({"m": 0.7})
 
-    def judge(wanted: Any, submit: Any, crew: Any, took: Any) -> None:
+    def judge(wanted: Any, call: Any, took: Any, workers: Any) -> None:
         for job in wanted:
             run.append(json.loads(job.settings)["k"])
             took(job, Judgement({"m": 0.5}))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from softneck.core import KINDS, FileFormatError, OutputFileError, SettingsError
 from softneck.core._kinds import make_settings
 from softneck.plant import NeckParameters
 from softneck.robot import Robot, Scaling
-from softneck.tuning import task_of, tune
+from softneck.tuning import _search, task_of, tune
 from softneck.tuning._compare import active_requirement, front
 from softneck.tuning._judge import cases, judged_delay, told_conditions
 from softneck.tuning._requirements import make_tune_requirements
@@ -203,38 +204,53 @@ def test_a_log_gives_back_what_was_judged_and_has_refusals_tried_again(tmp_path:
     assert job == Job.of("pi", {"a": 1e-17 + 0.1, "b": 1.25}, "all")
 
 
-def test_work_is_given_out_two_to_a_worker_and_all_of_it_comes_back() -> None:
-    out, given = list[Job](), list[Job]()
+@pytest.mark.parametrize("size", [0, 1, 2, 3])
+def test_work_is_given_out_two_to_a_worker_and_all_of_it_comes_back(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
+    """This process works too; what it leaves to workers leaves its own threads no core."""
+    out, given, here, taken = set[str](), list[str](), list[str](), list[int]()
 
-    class Lazy:
-        size = 2
-
-    def run(job: Job) -> Future:
-        out.append(job)
-        given.append(job)
-        assert len(out) <= 4
+    def submit(call: Any) -> Future:
         future: Future = Future()
-        future.set_result(job.settings)
+        future.set_result(call())
+        given.append(call())
+        out.add(call())
+        assert len(out) <= 2 * size
         return future
+
+    @contextlib.contextmanager
+    def cores_taken(count: int) -> Iterator[None]:
+        taken.append(count)
+        assert count == len(out)
+        yield
 
     jobs, back = [Job("pi", str(k), "all") for k in range(9)], []
 
     def took(job: Job, result: Any) -> None:
-        out.remove(job)
+        if job.settings not in out:
+            here.append(job.settings)
+        out.discard(job.settings)
         back.append((job, result))
 
-    run_jobs(jobs, run, Lazy(), took)  # pyright: ignore[reportArgumentType]
+    monkeypatch.setattr(_search, "cores_taken", cores_taken)
+    workers: Any = SimpleNamespace(size=size, pool=SimpleNamespace(submit=submit)) if size else None
+    run_jobs(jobs, lambda job: lambda: job.settings, took, workers)  # pyright: ignore[reportArgumentType, reportReturnType]
     assert sorted(back, key=lambda pair: pair[1]) == [(job, job.settings) for job in jobs]
     # The better ones stand first: a search that is stopped has judged those.
-    assert given == jobs
+    assert (given, here) == (sorted(given), sorted(here))
+    assert len(here) == len(taken) == 9 - len(given)
+    assert bool(given) == bool(size)
+    # A single one is not given away: this process would wait for it.
+    run_jobs(jobs[:1], lambda job: lambda: job.settings, took, workers)  # pyright: ignore[reportArgumentType, reportReturnType]
+    assert (here[-1], taken[-1]) == ("0", 0)
 
 
 def test_a_worker_that_dies_ends_a_search_with_what_to_do() -> None:
-    def run(_: Job) -> Future:
+    def submit(_: Any) -> Future:
         raise BrokenExecutor
 
+    worker: Any = SimpleNamespace(size=1, pool=SimpleNamespace(submit=submit))
     with pytest.raises(SoftneckError, match=r"a worker process died .*; run the same command again"):
-        run_jobs([Job("pi", "", "all")], run, SimpleNamespace(size=1), lambda *_: None)  # pyright: ignore[reportArgumentType]
+        run_jobs([Job("pi", "", "all")] * 2, lambda _: dict, lambda *_: None, worker)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("kind", [*KINDS_SEARCHED, "nmpc"])

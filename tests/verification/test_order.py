@@ -238,7 +238,7 @@ def stepped(monkeypatch: pytest.MonkeyPatch, members: list[np.ndarray], others: 
         return y, np.zeros((1, len(signals), 3))
 
     monkeypatch.setattr(_steps, "_run", run)
-    return run_steps(plants, CONTROLLER().block(), TEST, workers=1)
+    return run_steps(plants, CONTROLLER().block(), TEST)
 
 
 @pytest.mark.parametrize("name", _steps.METRICS)

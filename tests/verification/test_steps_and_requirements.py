@@ -100,7 +100,7 @@ def test_a_load_comes_in_the_second_half_on_the_stepped_axis_alone_and_noise_sca
 
     def run(**changes: float) -> Any:
         values = {"step": 0.2, "duration": 2.0, "noise": 0.0, "load": 0.0, **changes}
-        return run_steps(plants, block, StepTest(seed=3, **values), workers=1)
+        return run_steps(plants, block, StepTest(seed=3, **values))
 
     calm, loaded = run(), run(load=0.05)
     half = 100
@@ -624,13 +624,14 @@ def test_steps_are_made_around_the_rest_of_a_robot_or_the_middle_of_its_ranges()
     assert middle_motors(robot(motors=ends | {"rest": [3.0, 12.0]}), block) == pytest.approx([3e3, 12e3])
 
 
-@pytest.mark.parametrize("workers", [1, 2, 3, 9])
+@pytest.mark.parametrize("cores", [1, 2, 3, 9])
 def test_each_plant_is_stepped_once_with_the_channels_of_its_controller(
-    workers: int, monkeypatch: pytest.MonkeyPatch
+    cores: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A channel that a controller lacks has no place; one that looks ahead sees the step from the start."""
     plants = all_plants([source_of_family(family(), "f")], 24, 0).take(range(7))
     seen: list[Any] = []
+    monkeypatch.setattr(_steps, "core_count", lambda: cores)
     monkeypatch.setattr(_steps, "load_functions", lambda _: SimpleNamespace(sweep_run=lambda *args: seen.append(args)))
     inputs = [
         "roll_reference",
@@ -648,7 +649,7 @@ def test_each_plant_is_stepped_once_with_the_channels_of_its_controller(
         outputs=[SimpleNamespace(name=name) for name in outputs],
     )  # fmt: skip
     signals = np.arange(28.0).reshape(4, 7) + 100.0
-    y, P = _steps._run(plants, block, signals, np.eye(3), Robot.preset(), workers)
+    y, P = _steps._run(plants, block, signals, np.eye(3), Robot.preset())
     assert (y.shape, P.shape) == ((7, 4, 2), (7, 4, 3))
     first, *rest = seen
     assert first[5].shape[0] == 1
@@ -656,7 +657,7 @@ def test_each_plant_is_stepped_once_with_the_channels_of_its_controller(
     stepped = sorted(str(row) for args in rest for row in args[5].tolist())
     assert stepped == sorted(map(str, plants.numerator.tolist()))
     assert sum(len(args[-1]) for args in rest) == sum(len(args[8]) for args in rest) == 7
-    assert len(rest) == min(workers, 7)
+    assert len(rest) == min(cores, 7)
     start, places, outputs_at = first[2], first[3], first[4]
     assert start.tolist() == [0.5, 1.5, 100.0, 3.5, 4.5, 5.5, 6.5]
     # References, co-contraction, outputs, positions, healthy, enabled.

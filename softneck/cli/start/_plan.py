@@ -259,9 +259,8 @@ def _controller(options: Options) -> Iterator[Step]:
     words = [word for name, value in (("--requirements", stated), ("--kinds", kinds),
                                       ("--budget", options.budget), ("--seed", options.seed))
              if value is not None for word in (name, str(value))]  # fmt: skip
-    # --force continues the same search, and replaces another one. In this process: with empty caches each further
-    # process compiles the same again, which takes most of the time of the search.
-    command = ("softneck", "tune", *plants, *words, "--observer", OBSERVER, "--workers", "0", "-o", "tune", "--force")
+    # --force continues the same search, and replaces another one.
+    command = ("softneck", "tune", *plants, *words, "--observer", OBSERVER, "-o", "tune", "--force")
     fmus = _fmus(plant, options)
     yield Step(stage="tune", command=command, makes=(BEST, _TUNED_LOOP, "tune/report.html", TUNER),
                reads=(*plants, OBSERVER, *wanted), finding=finding, beside=tuple(fmus[:2]))  # fmt: skip

@@ -27,6 +27,7 @@ from softneck.core import (
     require_package,
     shown_progress,
     silent,
+    take_cores,
 )
 
 from ..loops._loop_file import make_loop
@@ -141,9 +142,10 @@ def check_sendable(thing: Any) -> None:
 
 
 def _begin_worker(folder: str) -> None:
-    # The parent handles Ctrl-C, and removes the folder with the unpacked FMUs.
+    # The parent handles Ctrl-C, and removes the folder with the unpacked FMUs. Its workers share the cores already.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     tempfile.tempdir = folder
+    take_cores(core_count())
 
 
 Row = dict[str, Any]
