@@ -31,8 +31,8 @@ def compute_once(compute: Callable[[], _T], *things: Any) -> _T:
     return kept[0]
 
 
-# A search and the certificates of its best need five results, a comparison of kinds ten drives.
-@lru_cache(maxsize=16)
+# A search and the certificates of its best need a dozen results, a comparison of kinds ten drives.
+@lru_cache(maxsize=32)
 def _results(digest: str) -> tuple[threading.RLock, list[Any]]:
     del digest
     return threading.RLock(), []

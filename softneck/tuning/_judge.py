@@ -386,18 +386,22 @@ def hardest_draws(task: Task, kind: str, settings: Mapping[str, Any]) -> dict[st
 
     The disturbance of a draw is the same for all controllers, so these are hard for others as well.
     """
-    controller, found = design_candidate(task, prepare(task), kind, settings), {}
-    order, eyes = str(getattr(controller, "order", "sequential")), make_observer(task, kind)
-    for name, thing in task.linear.items():
-        if getattr(thing, "draws", None) is not None:
-            values = run_steps_on_draws(
-                name, thing.draws, controller.block(), task.asked.certificate, order=order, observer=eyes,
-                numbers=range(len(thing.draws.for_search())),
-            )  # fmt: skip
-            each = [np.argsort(-np.nan_to_num(values[f"sim.{metric}"], nan=np.inf), kind="stable")[:_HARDEST]
-                    for metric in ("overshoot_pct", "rise_s")]  # fmt: skip
-            found[name] = tuple(np.unique(each).tolist())
+    found = {}
+    for name, values in steps_on_all_draws(task, kind, settings).items():
+        each = [np.argsort(-np.nan_to_num(values[f"sim.{metric}"], nan=np.inf), kind="stable")[:_HARDEST]
+                for metric in ("overshoot_pct", "rise_s")]  # fmt: skip
+        found[name] = tuple(np.unique(each).tolist())
     return found
+
+
+def steps_on_all_draws(task: Task, kind: str, settings: Mapping[str, Any]) -> dict[str, dict[str, Vector]]:
+    """Return family -> metric -> the worst value in the steps of each draw that a search may see."""
+    controller, asked = design_candidate(task, prepare(task), kind, settings), task.asked.certificate
+    where = {"order": str(getattr(controller, "order", "sequential")), "observer": make_observer(task, kind)}
+    return {
+        name: run_steps_on_draws(name, thing.draws, controller.block(), asked, **where)
+        for name, thing in task.linear.items() if getattr(thing, "draws", None) is not None
+    }  # fmt: skip
 
 
 def margin_metrics(

@@ -24,7 +24,7 @@ from softneck.core import Progress, SoftneckError, cores_taken, worst
 from softneck.cosim import WorkerPool
 from softneck.verification import Requirement
 
-from ._judge import LEVELS, hardest_draws, judge_candidate, prepare
+from ._judge import LEVELS, hardest_draws, judge_candidate, prepare, steps_on_all_draws
 from ._space import COSTLY, Space
 from ._task import Job, Judgement, Log, Task
 
@@ -198,9 +198,15 @@ class Search:
             self._judge_finals(best_of_kinds(last)[:finals])
 
     def _judge_finals(self, items: Sequence[Candidate]) -> None:
-        """Judge the first, and those that are better still: more loops improve no value, so the others cannot win."""
-        self._judge(items[:1], "margins", 0)
-        self._judge([item for item in items[1:] if self.cost(item) < self.cost(items[0])], "margins", 0)
+        """Judge the best, and those that are better still: more loops improve no value, so the others cannot win."""
+        for item in items if self.task.drawn else ():
+            for steps in steps_on_all_draws(self.task, item.kind, item.settings).values():
+                item.update(item.level, Judgement({metric: worst(metric, each) for metric, each in steps.items()}))
+        best = math.inf
+        for item in sorted(items, key=self.cost):
+            if self.cost(item) < best:
+                self._judge([item], "margins", 0)
+                best = min(best, self.cost(item))
 
     def sort_candidates(self) -> list[Candidate]:
         """Return all candidates with metrics, the best first."""

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -48,6 +48,8 @@ _CONFIDENCE = 0.95
 _BISECTED, _PROBED = 3, 2.0
 # Steps may be so much larger than the largest recorded motion.
 _BEYOND = 1.1
+# Metric -> value and condition of every step of a draw.
+_Steps: TypeAlias = dict[str, list[tuple[float, str]]]
 _MARGINS = ("axes.gain_margin", "axes.delay_margin_ms")
 
 
@@ -176,17 +178,18 @@ def run_drawn(
 
 def run_steps_on_draws(
     name: str, draws: Draws, controller: Block, asked: Requirements, *, order: str, observer: Block | None,
-    numbers: Sequence[int],
+    numbers: Sequence[int] | None = None,
 ) -> dict[str, Vector]:  # fmt: skip
-    """Return metric -> the worst value in the steps of each of these draws of a search, as `run_drawn` makes them."""
+    """Return metric -> the worst value in the steps of each of these draws of a search, as `run_drawn` makes them.
+
+    `numbers` None is all of them; `run_drawn` does not make those again.
+    """
     task = _task_of(name, draws, controller, asked, order, observer, 0)
-
-    def one(number: int) -> dict[str, float]:
-        return {metric: worst(metric, [value for value, _ in found]) for metric, found in _steps(task, number).items()}
-
-    results = [one(numbers[0])]
-    results += side_by_side([partial(one, number) for number in numbers[1:]])
-    return {metric: np.array([found[metric] for found in results]) for metric in results[0]}
+    results = _all_steps(task, name, 0) if numbers is None else _steps_side_by_side(task, numbers)
+    return {
+        metric: np.array([worst(metric, [value for value, _ in found[metric]]) for found in results])
+        for metric in results[0]
+    }
 
 
 def oscillating_share(
@@ -217,21 +220,20 @@ def _run_all(
     task = _task_of(name, draws, controller, asked, order, observer, attempt)
     plants, done = task.plants, 0
 
-    def one(number: int) -> tuple[dict[str, list[tuple[float, str]]], list[_Margin]]:
+    def margins_of(number: int) -> list[_Margin]:
         nonlocal done
-        found = _steps(task, number), _margins(task, number)
+        found = _margins(task, number)
         done += 1
-        progress(0.9 * done / len(plants), f"draw {done} of {len(plants)}")
+        progress(0.3 + 0.6 * done / len(plants), f"draw {done} of {len(plants)}")
         return found
 
-    # The first draw compiles the loop, once instead of in every thread.
-    results = [one(0)]
-    results += side_by_side([partial(one, number) for number in range(1, len(plants))])
-    failed = {item.number for _, margins in results for item in margins if item.oscillates}
+    steps = _all_steps(task, name, attempt)
+    margins = side_by_side([partial(margins_of, number) for number in range(len(plants))])
+    failed = {item.number for each in margins for item in each if item.oscillates}
     values: dict[str, list[float]] = {}
     conditions: dict[str, list[dict[str, Any]]] = {}
-    for number, (steps, _) in enumerate(results):
-        for metric, found in steps.items():
+    for number, by_metric in enumerate(steps):
+        for metric, found in by_metric.items():
             bounds = [item for item in asked.bounds if item.metric == metric]
             for value, condition in found:
                 values.setdefault(metric, []).append(value)
@@ -239,9 +241,9 @@ def _run_all(
                 if not all(item.holds(value) for item in bounds):
                     failed.add(number)
     # A gain raised and one lowered are two margins: the slow loop of a lower gain swings longer, and may never fail.
-    kinds = dict.fromkeys((item.metric, item.experiment.what) for _, margins in results for item in margins)
+    kinds = dict.fromkeys((item.metric, item.experiment.what) for each in margins for item in each)
     for metric, kind in kinds:
-        alike = [[m for m in margins if (m.metric, m.experiment.what) == (metric, kind)] for _, margins in results]
+        alike = [[m for m in each if (m.metric, m.experiment.what) == (metric, kind)] for each in margins]
         progress(0.95, f"bisect {metric}")
         for value, item in side_by_side([partial(_least_margin, m) for m in sorted(alike, key=_severity)[:_BISECTED]]):
             values.setdefault(metric, []).append(value)
@@ -295,7 +297,23 @@ def _payloads(plant: SimulationModel, asked: Requirements) -> tuple[float, ...]:
     return tuple(dict.fromkeys((min(found), max(found))))
 
 
-def _steps(task: _Task, number: int) -> dict[str, list[tuple[float, str]]]:
+def _all_steps(task: _Task, name: str, attempt: int) -> list[_Steps]:
+    """Return the steps of all draws; a search makes those of its final candidates before their margins."""
+
+    def compute() -> list[_Steps]:
+        return _steps_side_by_side(task, range(len(task.plants)))
+
+    given = (task.controller, task.asked.tables, task.order, task.observer)
+    return compute_once(compute, name, task.draws, attempt, *given)
+
+
+def _steps_side_by_side(task: _Task, numbers: Sequence[int]) -> list[_Steps]:
+    # The first draw compiles the loop, once instead of in every thread.
+    first = _steps(task, numbers[0])
+    return [first, *side_by_side([partial(_steps, task, number) for number in numbers[1:]])]
+
+
+def _steps(task: _Task, number: int) -> _Steps:
     """Return metric -> value and condition, which the draw's name begins, of every step of a draw."""
     asked, plant, robot = task.asked, task.plants[number], task.asked.robot
     several = len(robot.outputs.names) > 1

@@ -1130,30 +1130,39 @@ def test_a_search_is_led_by_what_it_aims_at_and_its_finals_are_of_each_kind(monk
     assert len(judged) == 1
 
 
-@given(st.lists(st.tuples(st.floats(0.1, 0.9), st.floats(0.0, 2.0)), min_size=1, max_size=6))
-@example([(0.5, 0.0), (0.5, 0.0)])
-def test_final_candidates_that_are_left_out_could_not_win(values: list[tuple[float, float]]) -> None:
+@given(st.lists(st.tuples(*[st.floats(0.1, 0.9)] * 3), min_size=1, max_size=6), st.booleans())
+@example([(0.5, 0.1, 0.1), (0.5, 0.1, 0.1)], True)
+def test_finals_that_are_left_out_could_not_win(values: list[tuple[float, float, float]], drawn: bool) -> None:
     """The best is the same as if all were judged, and so is its value: more loops only add to a cost."""
-    search, judged = searching("a", own={"p": 1}), list[Any]()
-    items = [of_kind("a", before, number=k) for k, (before, _) in enumerate(sorted(values))]
-    added = [more for _, more in sorted(values)]
+    search, judged, name = searching("a", own={"p": 1}, drawn=("d",) * drawn), list[Candidate](), "sim.overshoot_pct"
+    search.task.aims = (Requirement(name, "max", 1.0, True),)  # pyright: ignore[reportAttributeAccessIssue]
+    items = [Candidate("a", {}, np.zeros(1), "all", {name: before, "axes.sensitivity": 1.0}) for before, _, _ in values]
+    of_steps = [before + steps * drawn for before, steps, _ in values]
+    whole = [known + more for known, (_, _, more) in zip(of_steps, values, strict=True)]
+    for number, item in enumerate(items):
+        item.settings = {"number": number}
 
-    def judge(some: Any, level: str, reserved: int) -> None:
+    def steps(_: Any, kind: str, settings: Any) -> Any:
+        assert kind == "a"
+        assert not judged  # margins cost more
+        return {"f": {name: np.array([0.0, of_steps[settings["number"]]])}, "g": {name: np.zeros(2)}}
+
+    def judge(some: list[Candidate], level: str, reserved: int) -> None:
         assert (level, reserved) == ("margins", 0)
         for item in some:
             judged.append(item)
-            item.metrics["m"] += added[items.index(item)]
+            item.metrics[name] = whole[item.settings["number"]]
 
-    all_of_them = min(before + more for before, more in zip((one.metrics["m"] for one in items), added, strict=True))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search.__class__, "_judge", lambda _, *given: judge(*given))
+        patch.setattr(_search, "steps_on_all_draws", steps)
         search._judge_finals(items)
-    assert min(item.metrics["m"] for item in judged) == all_of_them
-    assert judged[0] is items[0]
-    assert all(before < items[0].metrics["m"] for before, item in zip(sorted(b for b, _ in values), items, strict=True)
-               if item in judged[1:])  # fmt: skip
-    # Those that are worse than the first before their judgement have none.
-    assert all(item.metrics["m"] >= items[0].metrics["m"] for item in items if item not in judged)
+    assert min(item.metrics[name] for item in judged) == min(whole)
+    # Each was better than the best so far, and those left out are not.
+    begun = [of_steps[item.settings["number"]] for item in judged]
+    assert begun == sorted(begun)
+    assert all(start < min(whole[one.settings["number"]] for one in judged[:k]) for k, start in enumerate(begun) if k)
+    assert all(item.metrics[name] >= min(whole) for item in items if item not in judged)
 
 
 @pytest.mark.parametrize("tested", [True, False])

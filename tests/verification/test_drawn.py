@@ -630,7 +630,8 @@ def test_equal_loops_run_once_and_every_other_attempt_limit_or_draw_runs_its_own
 
     monkeypatch.setattr(_drawn, "make_simulation_model", lambda _, name, __: SimpleNamespace(name=name))
     monkeypatch.setattr(_drawn, "_steps", steps)
-    monkeypatch.setattr(_drawn, "_margins", lambda *_: [])
+    margins: list[int] = []
+    monkeypatch.setattr(_drawn, "_margins", lambda _, number: margins.append(number) or [])
     monkeypatch.setattr(_drawn, "_amplitudes", lambda *_: (0.1,))
     monkeypatch.setattr(_drawn, "directions_of", lambda _: None)
     monkeypatch.setattr(ToldDraws, "model", None, raising=False)
@@ -653,14 +654,15 @@ def test_equal_loops_run_once_and_every_other_attempt_limit_or_draw_runs_its_own
     assert run(limit=2.0).failed == (0, 1, 2)
     assert run(limit=2.0, bound="min").failed == ()
     assert (run(attempt=2).attempt, run(seed=8).draws.seed) == (2, 8)
-    assert len(runs) == 15
+    # Steps have no limit to depend on.
+    assert (len(margins), len(runs)) == (15, 9)
     # What the user stated changes what is told of equal loops.
     payloads = make_requirements({}).sim["payloads_kg"]
     assert "sim" in run(payloads_kg=payloads).unreached
     assert not again.unreached
     # Four deviations of 0.19 deg are more than 5 % of 15 deg.
     assert [run(step={"noise_deg": noise}).noisy for noise in (0.18, 0.19)] == [False, True]
-    assert len(runs) == 21
+    assert (len(margins), len(runs)) == (21, 15)
 
 
 def test_each_kind_of_margin_is_bisected_on_the_draws_that_swing_most(monkeypatch: pytest.MonkeyPatch) -> None:
