@@ -52,7 +52,7 @@ from ._study_page import kept_runs, study_sections
 from ._validation_page import drawable
 
 # Folders that do not belong to a project, like those whose name begins with a dot.
-_SKIPPED_FOLDERS = ("__pycache__", "node_modules", "site-packages", "worst", "runs.parts")
+_SKIPPED_FOLDERS = ("__pycache__", "node_modules", "site-packages", "worst")
 # Ending of the layouts that an import proposes.
 _LAYOUT_ENDING = ".layout.toml"
 # [bytes] Larger logs are not drawn, so that the page remains small enough for mail.

@@ -195,7 +195,6 @@ def test_resume_goes_on_where_it_stood(place: Path) -> None:
     store = Store(made, place / "out")
     rows: Any = whole.to_dict("records")
     store.add([{**row, "holds": bool(row["holds"])} for row in rows[3:9]])
-    store.add([{**row, "holds": bool(row["holds"])} for row in rows[7:9]])  # twice, as after a kill in a merge
     assert read_runs(place / "out")["run"].tolist() == list(range(3, 9))
     runs: Any = study(made, workers=0, output=place / "out")
     pd.testing.assert_frame_equal(numbers(whole), numbers(runs), check_exact=True)
@@ -224,17 +223,6 @@ def test_runs_read_back_to_the_bit(place: Path) -> None:
             (True, False, None)[k % 3] for k in range(8)
         ]
         assert table["error"].str.startswith('a "fault", in two ').all()
-
-
-@pytest.mark.slow
-def test_many_small_files_are_joined(place: Path) -> None:
-    made = make_study(place / "loop.toml", vary={"plant.parameters.pole": {"uniform": [0.8, 0.9]}}, runs=250)
-    store = Store(made, place / "out")
-    for run in range(250):
-        store.add([failed_row(made.points[run], "not run", METRICS)])
-    assert len(list((place / "out" / "runs.parts").glob("*.csv"))) < 110
-    assert read_runs(place / "out")["run"].tolist() == list(range(250))
-    assert store.finish()["run"].tolist() == list(range(250))
 
 
 def test_a_folder_of_another_study(place: Path) -> None:

@@ -22,7 +22,7 @@ from softneck.core import DataError, FileFormatError, OutputFileError, SettingsE
 from softneck.cosim import LoopSetup, group_runs, held_runs, make_study, pareto_front, rank, read_runs, worst_runs
 from softneck.cosim.loops._loop_table import OBJECT
 from softneck.cosim.studies import _run_study, _store, _study
-from softneck.cosim.studies._store import Store, _spread, column_types, pareto_rows, read_tables, write_worst
+from softneck.cosim.studies._store import Store, _spread, column_types, pareto_rows, write_worst
 from softneck.cosim.studies._study import Vary
 from softneck.loop import Loop, metric_names
 from softneck.plots import distribution_chart
@@ -131,35 +131,23 @@ def test_a_run_tells_its_metrics_and_whether_its_limits_hold_if_it_has_some(
     assert dead == {**expected, ERROR: None, "holds": False, "error": "died", "seconds": None}
 
 
-def test_a_run_that_is_on_the_disk_twice_counts_once(tmp_path: Path) -> None:
-    files = [tmp_path / name for name in ("a.csv", "b.csv")]
-    for file, numbers in zip(files, ((2, 0), (0, 1)), strict=True):
-        # As of a run that was repeated: the same numbers, in another time.
-        runs = runs_of([10.0 + number for number in numbers]).assign(run=numbers, seconds=file.name == "b.csv")
-        runs.to_csv(file, index=False)
-    table = read_tables(files, {"kind": Vary("choices", labels=("a",))})
-    assert table["run"].tolist() == [0, 1, 2]
-    assert table[ERROR].tolist() == [10.0, 11.0, 12.0]
-
-
-def test_files_of_a_study_never_grow_beyond_their_number_and_lose_no_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(_store, "_MERGE_AT", 4)
+def test_a_line_that_was_not_finished_is_no_run_and_the_study_goes_on_behind_it(tmp_path: Path) -> None:
     made = make_study({"duration_s": 1.0, "plant": {"neck": "paper"}}, vary={"reference.at_s": [0.1, 0.2]}, runs=2)
-    store = Store(made, tmp_path)
-    row = {"sample": 0, "seed": 0, "reference.at_s": 0.1, "holds": True, "error": ""}
-    for run in range(11):
+    store, row = Store(made, tmp_path), {"sample": 0, "seed": 0, "reference.at_s": 0.1, "holds": True, "error": ""}
+    for run in (2, 0, 1):
         store.add([{"run": run, **row}])
-        assert len(list((tmp_path / "runs.parts").glob("*.csv"))) <= 4
-        assert store.frame()["run"].tolist() == list(range(run + 1))
-        assert store.done == set(range(run + 1))
-    # A study that goes on counts the files that are there.
+        assert run in store.done
+    whole = (tmp_path / "runs.csv").read_bytes()
+    (tmp_path / "runs.csv").write_bytes(whole + whole.splitlines(keepends=True)[1][:-9])  # as of a process that died
+    assert read_runs(tmp_path)["run"].tolist() == [0, 1, 2]
     again = Store(made, tmp_path)
-    again.add([{"run": 11, **row}])
-    assert len(list((tmp_path / "runs.parts").glob("*.csv"))) <= 4
-    assert again.finish()["run"].tolist() == list(range(12))
-    assert not (tmp_path / "runs.parts").exists()
+    assert again.done == {0, 1, 2}
+    again.add([{"run": 3, **row}])
+    assert again.finish()["run"].tolist() == [0, 1, 2, 3]
+    assert (tmp_path / "runs.csv").read_bytes().endswith(b"\n")
+    (tmp_path / "runs.csv").write_text("run,sample,seed,holds,error\n1,0,0,True,\n")
+    with pytest.raises(FileFormatError, match="has other columns than this study writes"):
+        Store(made, tmp_path)
 
 
 def test_groups_keep_their_own_runs() -> None:
@@ -200,19 +188,15 @@ def test_a_front_is_what_none_beats_in_whatever_order_runs_and_objectives_stand(
 
 
 @pytest.mark.parametrize("absent", ["run", "holds", "error"])
-def test_a_file_of_runs_without_a_column_or_with_others_is_refused(absent: str, tmp_path: Path) -> None:
-    whole, other = tmp_path / "a.csv", tmp_path / "b.csv"
-    runs_of((1.0, 2.0)).to_csv(whole, index=False)
-    runs_of((1.0, 2.0)).drop(columns=absent).to_csv(other, index=False)
-    vary = {"kind": Vary("choices", labels=("a",))}
+def test_a_file_of_runs_without_a_column_is_refused(absent: str, tmp_path: Path) -> None:
+    file, vary = tmp_path / "a.csv", {"kind": Vary("choices", labels=("a",))}
+    runs_of((1.0, 2.0)).drop(columns=absent).to_csv(file, index=False)
     with pytest.raises(FileFormatError, match=f"no column `{absent}`"):
-        read_tables([whole, other], vary)
-    runs_of((1.0, 2.0)).assign(more=1.0).to_csv(other, index=False)
-    with pytest.raises(FileFormatError, match="has other columns than"):
-        read_tables([whole, other], vary)
-    other.write_text(whole.read_text() + "3,a,1.0,,,7\n")  # a row that is longer than the header
+        _store._read(file, vary)
+    runs_of((1.0, 2.0)).to_csv(file, index=False)
+    file.write_text(file.read_text() + "3,a,1.0,,,7\n")  # a row that is longer than the header
     with pytest.raises(FileFormatError, match="cannot be read"):
-        read_tables([other], vary)
+        _store._read(file, vary)
 
 
 # -- workers that die --------------------------------------------------------------------------------------------------
@@ -480,7 +464,7 @@ def test_a_cluster_is_asked_for_each_run_anew_and_has_two_chunks_for_each_of_its
 def test_what_was_varied_is_read_back_as_it_was_written(vary: Vary, values: Any, kind: str, tmp_path: Path) -> None:
     table = runs_of((1.0, math.inf), holds=[True, None], errors=["", "it\u2028is, gone"]).assign(kind=values)
     table.to_csv(tmp_path / "a.csv", index=False)
-    found = read_tables([tmp_path / "a.csv"], {"kind": vary})
+    found = _store._read(tmp_path / "a.csv", {"kind": vary})
     assert column_types(["kind", "run", ERROR], {"kind": vary}) == {"kind": kind, "run": "int64", ERROR: "float64"}
     assert found["kind"].tolist() == values
     assert [type(value) for value in found["kind"].tolist()] == [type(value) for value in values]
@@ -495,16 +479,6 @@ def test_a_cell_is_one_line_that_every_reader_of_tables_takes() -> None:
     assert _store._cell("\ud800") == "\\ud800"  # half a character
     assert len(_store._cell("x" * 5000)) == 2000
     assert (_store._cell(1.5), _store._cell(None), _store._cell("")) == (1.5, None, "")
-
-
-def test_files_that_were_not_finished_are_no_runs(tmp_path: Path) -> None:
-    parts = tmp_path / "runs.parts"
-    parts.mkdir()
-    for name in ("b.csv", "a.csv", ".c.csv", "d.txt"):
-        (parts / name).touch()
-    assert _store._files(tmp_path) == [parts / "a.csv", parts / "b.csv"]
-    (tmp_path / "runs.csv").touch()
-    assert _store._files(tmp_path) == [tmp_path / "runs.csv", parts / "a.csv", parts / "b.csv"]
 
 
 @pytest.mark.parametrize("text", ["{}", "[]", "1", "{", '{"format": 1}', None])

@@ -1,14 +1,13 @@
-"""The runs of a study on disk, as small files and finally one table, and their evaluation."""
+"""The runs of a study on disk, in one table that grows, and their evaluation."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
-import shutil
-import uuid
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,76 +34,64 @@ from ._study import Study, Vary
 if TYPE_CHECKING:
     import pandas as pd
 
-RUNS_FILE, STUDY_FILE, _PARTS_FOLDER = "runs.csv", "study.json", "runs.parts"
-# Number of small files at which they are merged.
-_MERGE_AT = 100
+RUNS_FILE, STUDY_FILE = "runs.csv", "study.json"
 # Longest text of a run's error [characters].
 _MAX_ERROR_LENGTH = 2000
 
 
 class Store:
-    """The folder of a study: `study.json` describes it, and tables (`.csv`) hold the finished runs.
+    """The folder of a study: `study.json` describes it, and a table has the finished runs.
 
-    A run is finished when its file has its final name; `done` are the numbers of finished runs.
+    A run is finished when its whole line is in the table; `done` are the numbers of finished runs.
     """
 
     def __init__(self, study: Study, folder: Path, *, force: bool = False) -> None:
         """Start the study in `folder`, or continue the same one there; with `force` replace any study."""
-        self.folder, self._study, self._parts = folder, study, folder / _PARTS_FOLDER
+        self.folder, self._study, self._runs = folder, study, folder / RUNS_FILE
         if (folder / STUDY_FILE).is_file() and not force:
             self._check_same(study)
         else:
-            shutil.rmtree(self._parts, ignore_errors=True)
-            (folder / RUNS_FILE).unlink(missing_ok=True)
+            self._runs.unlink(missing_ok=True)
             text = json.dumps(_description(study), indent=2) + "\n"
             with atomic_write(folder / STUDY_FILE, force=True) as temporary:
                 temporary.write_text(text, encoding="utf-8")
-        try:
-            self._parts.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputFileError(f"{self._parts}: cannot be written: {error.strerror}.") from error
-        self.done = set(self.frame()["run"].tolist())
-        self._files = len(list(self._parts.glob("*.csv")))
+        self.done = set(self.finish()["run"].tolist())
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Write rows of finished runs; they are on the disk when this returns."""
         table = self._frame([{name: _cell(value) for name, value in row.items()} for row in rows])
-        self._write(table, self._parts / f"{rows[0]['run']:08d}-{uuid.uuid4().hex[:8]}.csv")
+        try:
+            with self._runs.open("a", encoding="utf-8", newline="") as file:
+                table.to_csv(file, index=False, header=False, lineterminator="\n")
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise OutputFileError(f"{self._runs}: cannot be written: {error.strerror}.") from error
         self.done.update(row["run"] for row in rows)
-        self._files += 1
-        if self._files >= _MERGE_AT:
-            self._merge(self._parts / f"merged-{uuid.uuid4().hex[:8]}.csv")
-            self._files = 1
 
     def frame(self) -> pd.DataFrame:
         """Return all finished runs in the order of their numbers."""
-        files = _files(self.folder)
-        return read_tables(files, self._study.vary) if files else self._frame([])
+        table = self._frame([])
+        if not self._runs.is_file():
+            return table
+        found = _read(self._runs, self._study.vary)
+        if not found.columns.equals(table.columns):
+            raise FileFormatError(f"{self._runs}: has other columns than this study writes; --force begins it anew.")
+        return found
 
     def finish(self) -> pd.DataFrame:
-        """Write all runs into one file, remove the small ones, and return the table."""
-        self._merge(self.folder / RUNS_FILE)
-        shutil.rmtree(self._parts, ignore_errors=True)
-        return self.frame()
+        """Write the table anew in the order of the runs, without a line that was not finished, and return it."""
+        table = self.frame()
+        with atomic_write(self._runs, force=True) as temporary:
+            # The shortest digits that read back the same.
+            table.to_csv(temporary, index=False, encoding="utf-8", lineterminator="\n")
+        return table
 
     def _frame(self, rows: list[dict[str, Any]]) -> pd.DataFrame:
         import pandas as pd
 
         names = ["run", "sample", "seed", *self._study.vary, *self._study.metrics, "holds", "error", "seconds"]
         return pd.DataFrame(rows, columns=names).astype(column_types(names, self._study.vary))
-
-    def _merge(self, target: Path) -> None:
-        files = list(self._parts.glob("*.csv"))
-        whole = target.parent == self.folder
-        self._write(self.frame() if whole else read_tables(files, self._study.vary), target)
-        # If the process is killed here, runs are there twice; `read_tables` reads each once.
-        for file in files:
-            file.unlink(missing_ok=True)
-
-    def _write(self, table: pd.DataFrame, path: Path) -> None:
-        # The shortest digits that read back the same.
-        with atomic_write(path, force=True) as temporary:
-            table.to_csv(temporary, index=False, encoding="utf-8", lineterminator="\n")
 
     def _check_same(self, study: Study) -> None:
         there = read_study_description(self.folder)
@@ -147,28 +134,19 @@ def read_runs(folder: str | Path) -> pd.DataFrame:
     for key, item in varied.items() if isinstance(varied, dict) else ():
         labels = item.get("labels") if isinstance(item, dict) else None
         kinds[key] = Vary(item.get("kind", ""), labels=tuple(labels)) if isinstance(labels, list) else Vary("")
-    files = _files(Path(folder))
-    return read_tables(files, kinds) if files else pd.DataFrame({"run": pd.Series(dtype="int64")})
-
-
-def read_tables(files: Sequence[Path], vary: Mapping[str, Vary]) -> pd.DataFrame:
-    """Return the rows of all files in the order of their numbers, each run once."""
-    import pandas as pd
-
-    parts = [_read(path, vary) for path in files]
-    for path, part in zip(files, parts, strict=True):
-        if not part.columns.equals(parts[0].columns):
-            raise FileFormatError(f"{path}: has other columns than {files[0]}.")
-    table = pd.concat(parts).drop_duplicates("run")
-    return table.sort_values("run", kind="stable", ignore_index=True)
+    file = Path(folder) / RUNS_FILE
+    return _read(file, kinds) if file.is_file() else pd.DataFrame({"run": pd.Series(dtype="int64")})
 
 
 def _read(path: Path, vary: Mapping[str, Vary]) -> pd.DataFrame:
+    """Return the whole lines of a table of runs, in the order of their numbers."""
     import pandas as pd
 
     require_table(path)
     try:
-        names = [str(name) for name in pd.read_csv(path, nrows=0).columns]
+        lines = path.read_bytes()
+        lines = lines[: lines.rfind(b"\n") + 1]
+        names = [str(name) for name in pd.read_csv(BytesIO(lines), nrows=0).columns]
         for name in ("run", "holds", "error"):
             if name not in names:
                 raise ValueError(f"no column `{name}`")
@@ -176,10 +154,11 @@ def _read(path: Path, vary: Mapping[str, Vary]) -> pd.DataFrame:
         with warnings.catch_warnings():
             # pandas only warns about rows that are longer than the header.
             warnings.simplefilter("error", pd.errors.ParserWarning)
-            return pd.read_csv(
-                path, dtype=types, index_col=False, keep_default_na=False,
+            table = pd.read_csv(
+                BytesIO(lines), dtype=types, index_col=False, keep_default_na=False,
                 na_values={name: [""] for name, kind in types.items() if kind in ("float64", "boolean")},
             )  # fmt: skip
+            return table.sort_values("run", kind="stable", ignore_index=True)
     except (ValueError, OSError, ArithmeticError, MemoryError, pd.errors.ParserWarning) as error:
         raise FileFormatError(f"{path}: holds runs that cannot be read ({error_reason(error)}).") from error
 
@@ -198,13 +177,6 @@ def _column_type(vary: Vary) -> str:
     if labels and not all(isinstance(label, int | float) and not isinstance(label, bool) for label in labels):
         return "str"
     return "int64" if labels and all(isinstance(label, int) for label in labels) else "float64"
-
-
-def _files(folder: Path) -> list[Path]:
-    whole = folder / RUNS_FILE
-    # Temporary names begin with a dot; these files were not finished.
-    small = [path for path in (folder / _PARTS_FOLDER).glob("*.csv") if not path.name.startswith(".")]
-    return ([whole] if whole.is_file() else []) + sorted(small)
 
 
 def _cell(value: Any) -> Any:
