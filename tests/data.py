@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import pytest
 from softneck.core import Matrix, Vector
 from softneck.identification import Model
 from softneck.identification.uncertainty._guarded import Base, Guarded
+from softneck.runtime import Block
 from softneck.signals import SET_POINTS, Recording, signal
 from softneck.signals.recording._channels import MOTOR_POSITIONS
 
@@ -30,6 +31,13 @@ def slow_but(values: Iterable[Any], short: Iterable[Any], nightly: Iterable[Any]
     assert short | nightly <= set(values), (short | nightly) - set(values)
     marks = {value: (pytest.mark.slow, *([pytest.mark.nightly] if value in nightly else [])) for value in values}
     return [value if value in short else pytest.param(value, marks=marks[value]) for value in values]
+
+
+def with_starts(block: Block, **starts: float) -> Block:
+    """Return the same block with other start values of its parameters."""
+    ports = tuple(replace(port, start=starts.pop(port.name, port.start)) for port in block.parameters)
+    assert not starts
+    return replace(block, parameters=ports)
 
 
 @dataclass(frozen=True, slots=True)

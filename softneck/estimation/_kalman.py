@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from softneck.core import FileFormatError, Matrix, ReprMixin, SettingsError, Vector, to_si, write_archive
 from softneck.robot import Robot
-from softneck.runtime import Block, Port, State, sized_name
+from softneck.runtime import Block, Port, SteppedMixin, sized_name
 from softneck.signals import Recording
 
 from ._forms import NOISES, STATES, noise_units, require_levels, system
@@ -51,7 +50,7 @@ _DELAY_SOURCES = {
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class KalmanObserver(ReprMixin):
+class KalmanObserver(SteppedMixin, ReprMixin):
     """A designed Kalman filter; `KalmanSettings.design` makes it.
 
     Attributes:
@@ -140,14 +139,6 @@ class KalmanObserver(ReprMixin):
                 for (name, unit), value in levels
             ),
         )  # fmt: skip
-
-    def initial_state(self, **parameters: float) -> State:
-        """Return the state at the start; parameters are the noise levels by name."""
-        return self.block().initial_state(**parameters)
-
-    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
-        """Return the next state and the outputs valid now; inputs and outputs as in `block()`."""
-        return self.block().step(state, inputs)
 
     def filterpy(self) -> KalmanFilter:
         """Return the configured `filterpy.kalman.KalmanFilter`, with an input and a measurement for each output.

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from softneck.core import FileFormatError, Matrix, ReprMixin, Vector, to_si, write_archive
 from softneck.identification import KINDS as LINEAR
 from softneck.identification import Model, embed_model, embedded_model, payloads, without_validity
 from softneck.robot import TIME_CONSTANT, Robot
-from softneck.runtime import Block, Port, State
+from softneck.runtime import Block, Port, SteppedMixin
 from softneck.signals import Recording
 
 from ._axis import directions_of, slowest_seconds
@@ -44,7 +43,7 @@ _NOISE_DESCRIPTIONS = ("standard deviation", "standard deviation", "of the model
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class NonlinearObserver(ReprMixin):
+class NonlinearObserver(SteppedMixin, ReprMixin):
     """A filter over an identified model of any kind; `KalmanSettings.design` makes it.
 
     The outputs are the model's simulation from the set-points, earlier or later by a timing error that varies, plus a
@@ -163,14 +162,6 @@ class NonlinearObserver(ReprMixin):
         free = plant.initial_state(use_measurement=0.0).parameters
         load = np.array([least, most, _PAYLOAD_WALK * (most - least) * math.sqrt(scaled)])
         return setup, self.constants, free, load
-
-    def initial_state(self, **parameters: float) -> State:
-        """Return the state at the start; parameters are the noise levels by name."""
-        return self.block().initial_state(**parameters)
-
-    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
-        """Return the next state and the outputs valid now; inputs and outputs as in `block()`."""
-        return self.block().step(state, inputs)
 
     def estimate(self, recording: Recording) -> Estimates:
         """Filter a recording; each of its runs starts anew. Missing samples are predicted over.

@@ -7,6 +7,7 @@ from ._compile import load_runtime as load_runtime
 
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
+from ._block import SteppedMixin as SteppedMixin
 from ._bundle import ANY_SIZE as ANY_SIZE
 from ._bundle import content_name as content_name
 from ._bundle import layout_of as layout_of

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -152,18 +152,31 @@ class Block(ReprMixin):
                 raise DataError(f"input `{port.name}` of {self.kind} is {column[row]} at row {row}; it must be finite.")
         return U
 
-    def with_starts(self, **starts: float) -> Block:
-        """Return the same block with other start values of its parameters."""
-        known = {port.name for port in self.parameters}
-        for name in starts:
-            if name not in known:
-                raise SettingsError(f"`{name}` is not a parameter of {self.kind}; it has {', '.join(sorted(known))}.")
-        ports = tuple(replace(port, start=starts.get(port.name, port.start)) for port in self.parameters)
-        return replace(self, parameters=ports)
-
     @property
     def _runtime(self) -> Runtime:
         return load_runtime(self.runtime)
+
+
+class SteppedMixin:
+    """Mixin of what has a `block()`: it steps as its block does."""
+
+    __slots__ = ()
+
+    def block(self) -> Block:
+        """Return the block that is stepped."""
+        raise NotImplementedError
+
+    def initial_state(self, **parameters: float) -> State:
+        """Return the state at the start; parameters by their names in `block()`."""
+        return self.block().initial_state(**parameters)
+
+    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
+        """Return the next state and the outputs valid now; inputs and outputs as in `block()`.
+
+        Raises:
+            DataError: wrong number of inputs, or one that is not finite.
+        """
+        return self.block().step(state, inputs)
 
 
 def _in_range(port: Port, value: Any) -> float:

@@ -155,15 +155,6 @@ def test_wrong_inputs_are_named(block_of: Callable[[str], Block]) -> None:
     block.step(state, [0, 0, 0, *[np.nan] * 5])  # not measured
 
 
-def test_start_values_can_be_replaced(block_of: Callable[[str], Block]) -> None:
-    block = block_of("rls")
-    moved = block.with_starts(pitch_start=0.2)
-    assert moved.initial_state().outputs[0] == 0.2
-    assert block.initial_state().outputs[0] == 0.0
-    with pytest.raises(SettingsError, match="`tilt` is not a parameter of rls"):
-        block.with_starts(tilt=1.0)
-
-
 def test_every_block_fits_its_runtime(block_of: Callable[[str], Block], tmp_path: Path) -> None:
     for kind in KINDS:
         block = block_of(kind)

@@ -24,6 +24,7 @@ from softneck.design.linear._fopi import FractionalPi
 from softneck.design.linear._pid import PidGains
 from softneck.design.plants._uncertain import StepAndLoad
 
+from ..data import with_starts
 from ..oracles.bake_off import bake_off_neck, bake_off_plant, bake_off_plants, block_stepper, exact, run_bake_off
 
 TS = 0.02
@@ -49,7 +50,7 @@ def test_the_sweep_of_a_search_is_the_bake_off(settings: Any, test: StepAndLoad)
     axis = axis_of(controller)
     time = controller.design["pitch"]["gains"]["reference_time_s"]
     swept = make_sweep(plants, test=test).run(axis, time, axis.conditioning())
-    slow = run_bake_off(block_stepper(controller.block().with_starts(lead_limit=12.0), test), plants, test)
+    slow = run_bake_off(block_stepper(with_starts(controller.block(), lead_limit=12.0), test), plants, test)
     # Sums in another order, over 300 samples.
     np.testing.assert_allclose(swept.angles, slow.angles, atol=1e-10)
 

@@ -20,6 +20,8 @@ from softneck.fmu import FmuInfo, build_fmu, fmu_info
 from softneck.fmu.describe._description import _SHOWN
 from softneck.runtime import Block, Port
 
+from ..data import with_starts
+
 GOLDEN = Path(__file__).parents[1] / "golden"
 KINDS = ["lag", "controller", "neck", "pi"]
 
@@ -46,7 +48,7 @@ def test_another_content_gives_another_guid(change: str, toys: Any, tmp_path: Pa
     if change == "array":
         block = toys.lag(pole=0.9000001)
     elif change == "start":
-        block = block.with_starts(pitch_start=0.1)
+        block = with_starts(block, pitch_start=0.1)
     elif change == "info":
         info = FmuInfo(author="somebody else")
     else:

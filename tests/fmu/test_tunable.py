@@ -25,6 +25,7 @@ from softneck.design.linear._pid import PidGains
 from softneck.fmu import build_compiled_fmu, build_fmu, exported_block, unpacked
 from softneck.runtime import Block, load_runtime
 
+from ..data import with_starts
 from ..importers import need
 from .every_kind import MOTORS, TS, block_of, inputs_of, plain_run
 from .test_importers import SCRIPTS
@@ -41,7 +42,7 @@ SIGNALS = ["pitch_reference", "roll_reference", "pitch", "roll", *(f"motor_posit
 
 @cache
 def _block(kind: str) -> Block:
-    return exported_block(block_of(kind)).with_starts(use_motor_positions=1.0)
+    return with_starts(exported_block(block_of(kind)), use_motor_positions=1.0)
 
 
 def _changed(kind: str, names: tuple[str, ...] = ("K", "Ti", "Td", "Tf")) -> dict[str, float]:

@@ -34,6 +34,8 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block, State, _compile, _numba_inner
 from softneck.runtime._own import OwnStep, own_runtime
 
+from ..data import with_starts
+
 _KEYS: dict[str, dict[str, Any]] = {
     "sensor_bias": {"size_deg": 2.0}, "sensor_outlier": {"size_deg": 5.0, "share": 0.2, "seed": 3},
     "sensor_delay": {"delay_s": 0.06}, "measurement_noise": {"std_deg": 0.5, "seed": 1}, "motor_stuck": {"motor": 2},
@@ -157,7 +159,7 @@ def test_what_is_missing_is_named_as_ever(loop: Callable[..., Loop]) -> None:
 def test_what_is_no_number_is_named_as_ever(loop: Callable[..., Loop], toy_blocks: Callable) -> None:
     """A gain beyond all bounds blows up within the run."""
     neck, pi = toy_blocks()
-    wild = pi.with_starts(gain=1e300)
+    wild = with_starts(pi, gain=1e300)
     case = loop(plant=BlockPart(neck), controller=BlockPart(wild), observer=None)
     errors = []
     for compiled in (False, True):

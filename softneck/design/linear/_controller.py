@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from softneck.core import Matrix, ReprMixin, SettingsError, Vector, atomic_write, require_header, to_si, write_archive
 from softneck.identification import redefined_input
 from softneck.robot import Robot
-from softneck.runtime import Block, State, sized_name
+from softneck.runtime import Block, SteppedMixin, sized_name
 
 from ..plants._uncertain import sampling_line
 from ._linear_parts_runtime import LinearArrays
@@ -161,7 +160,7 @@ _RUNTIME_MODULE = "softneck.design.linear._linear_controller_runtime"
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class LinearController(ReprMixin):
+class LinearController(SteppedMixin, ReprMixin):
     """A designed controller of all outputs with reference filter, limits, conditioning and allocation.
 
     Attributes:
@@ -197,14 +196,6 @@ class LinearController(ReprMixin):
             outputs=controller_outputs(self.robot),
             parameters=self.limits.ports(),
         )
-
-    def initial_state(self, **parameters: float) -> State:
-        """Return the state at the start; parameters are the limits by name."""
-        return self.block().initial_state(**parameters)
-
-    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
-        """Return the next state and the set-points valid now; inputs and outputs as in `block()`."""
-        return self.block().step(state, inputs)
 
     def ss(self) -> control.StateSpace:
         """Return it without limits, from (pitch_reference, roll_reference, pitch, roll) to (theta_i, phi_i)."""

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from softneck.core import FileFormatError, Matrix, ReprMixin, Vector, require_header, to_si, write_archive
 from softneck.estimation import AXES
 from softneck.loop import BlockPart
 from softneck.robot import Robot
-from softneck.runtime import Block, Port, State, load_functions
+from softneck.runtime import Block, Port, State, SteppedMixin, load_functions
 
 from ..linear._controller import assumed_lines, robot_in
 from ..linear._ports import MAX_MOTOR, ControllerLimits, controller_inputs, controller_outputs, limit_ports
@@ -151,7 +150,7 @@ class PredictivePart(BlockPart):
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class MpcController(ReprMixin):
+class MpcController(SteppedMixin, ReprMixin):
     """A linear predictive controller of all outputs; `MpcSettings.design` makes it.
 
     Attributes:
@@ -212,14 +211,6 @@ class MpcController(ReprMixin):
     def preview(self) -> float:
         """How far ahead the reference is known [s]."""
         return float(rt.MpcArrays(self.arrays).constants[rt.MPC_AHEAD]) * self.sample_time
-
-    def initial_state(self, **parameters: float) -> State:
-        """Return the state at the start; parameters are the limits by name."""
-        return self.block().initial_state(**parameters)
-
-    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
-        """Return the next state and the set-points valid now; inputs and outputs as in `block()`."""
-        return self.block().step(state, inputs)
 
     def ss(self) -> control.StateSpace:
         """Return it without limits, from (pitch_reference, roll_reference, pitch, roll) to (theta_i, phi_i)."""

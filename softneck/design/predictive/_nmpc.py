@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from softneck.core import (
     FileFormatError,
@@ -27,7 +26,7 @@ from softneck.core import (
 )
 from softneck.identification import Model, embed_model, embedded_model, weights_of, without_validity
 from softneck.robot import Robot
-from softneck.runtime import Block, Port, State, sized_name
+from softneck.runtime import Block, Port, State, SteppedMixin, sized_name
 from softneck.signals import TENDON_ANGLES
 
 from ..linear._ports import LIMITS, ControllerLimits, controller_inputs, controller_outputs
@@ -223,7 +222,7 @@ def explain(block: Block, values: Vector) -> SampleSolution:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class NmpcController(ReprMixin):
+class NmpcController(SteppedMixin, ReprMixin):
     """A nonlinear predictive controller of all outputs; `NmpcSettings.design` makes it.
 
     Attributes:
@@ -299,18 +298,6 @@ class NmpcController(ReprMixin):
             cocontraction_weight=1.0,
             look=samples_ahead(s.look_ahead, self.sample_time),
         )
-
-    def initial_state(self, **parameters: float) -> State:
-        """Return the state at the start; parameters are the limits by name."""
-        return self._block.initial_state(**parameters)
-
-    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
-        """Return the next state and the set-points valid now; inputs as `inputs`.
-
-        Raises:
-            DataError: wrong number of inputs, or one that is not finite.
-        """
-        return self._block.step(state, inputs)
 
     def info(self, state: State) -> SampleSolution:
         """Return the decision of the sample that led to `state`."""

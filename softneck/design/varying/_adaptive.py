@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from softneck.core import Matrix, ReprMixin, SettingsError, Vector, require_between, write_archive
 from softneck.estimation import NECK_REACH, AxisPlant, linear_reach
 from softneck.robot import Robot, Scaling, find_robot
-from softneck.runtime import Block, Port, State, sized_name
+from softneck.runtime import Block, Port, SteppedMixin, sized_name
 
 from ..linear._axis_loop import LOWEST, filter_for_lag, frequencies
 from ..linear._controller import ReferenceFilter, assemble, pi_axis, robot_in
@@ -263,7 +262,7 @@ class AdaptiveSettings(LoopSettings):
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class VaryingController(ReprMixin):
+class VaryingController(SteppedMixin, ReprMixin):
     """A controller of all outputs whose gains follow its estimates.
 
     Attributes:
@@ -304,14 +303,6 @@ class VaryingController(ReprMixin):
             outputs=controller_outputs(self.robot),
             parameters=(*self.limits.ports(), _ADAPT),
         )
-
-    def initial_state(self, **parameters: float) -> State:
-        """Return the state at the start; parameters are the limits by name."""
-        return self.block().initial_state(**parameters)
-
-    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
-        """Return the next state and the set-points valid now; inputs and outputs as in `block()`."""
-        return self.block().step(state, inputs)
 
     def summary(self) -> str:
         """Return some lines for people."""
