@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import FunctionType, ModuleType, SimpleNamespace
-from typing import Any
+from typing import IO, Any
 
 import platformdirs
 
@@ -29,6 +31,8 @@ COMPILE_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": 
 _INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 # One thread at a time loads: `cache` alone would let two start, and CPython 3.11's `ast` fails in two threads at once.
 _LOADING = threading.RLock()
+# [s] After this a process waits for no other: one that was stopped would stop all.
+_LONGEST_COMPILATION_S = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +179,44 @@ def _compiled(function: FunctionType, more: Mapping[str, Any], *, inner: bool) -
     options: Any = {**COMPILE_OPTIONS, "_nrt": True, **more} | ({} if made is None else {"pipeline_class": made[inner]})
     if inner:
         options = options | _INNER | ({} if made is None else {"cache": False})
-    return compile_without_failing_cache(njit(**options)(function))
+    dispatcher = compile_without_failing_cache(njit(**options)(function))
+    return dispatcher if inner else _compile_in_one_process(dispatcher)
+
+
+def _compile_in_one_process(dispatcher: Any) -> Any:
+    """Have one process at a time compile a function, so that others that need it load it then; return it.
+
+    Linux and macOS only; elsewhere, in a folder without locks, or where another process holds the lock for too long,
+    each process compiles for itself.
+    """
+    from numba.core.compiler_lock import global_compiler_lock
+
+    function = dispatcher.py_func
+    compile_here, path = dispatcher.compile, cache_folder() / f"{function.__module__}.{function.__name__}.lock"
+
+    def compile_alone(signature: Any) -> Any:
+        # In this order, as a function that is called is compiled within numba's lock.
+        with global_compiler_lock, contextlib.ExitStack() as stack:
+            with contextlib.suppress(OSError):
+                _wait_for(stack.enter_context(path.open("a")))
+            return compile_here(signature)
+
+    dispatcher.compile = compile_alone
+    return dispatcher
+
+
+def _wait_for(file: IO[str]) -> None:
+    """Lock a file until it is closed, or go on without."""
+    if sys.platform == "win32":
+        return
+    import fcntl
+
+    end = time.monotonic() + _LONGEST_COMPILATION_S
+    while time.monotonic() < end:
+        with contextlib.suppress(BlockingIOError):
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        time.sleep(0.05)
 
 
 @cache

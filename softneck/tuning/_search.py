@@ -24,7 +24,7 @@ from softneck.core import Progress, SoftneckError, cores_taken, worst
 from softneck.cosim import WorkerPool
 from softneck.verification import Requirement
 
-from ._judge import LEVELS, hardest_draws, judge_candidate, prepare, steps_on_all_draws
+from ._judge import LEVELS, hardest_draws, judge_candidate, steps_on_all_draws
 from ._space import COSTLY, Space
 from ._task import Job, Judgement, Log, Task
 
@@ -171,8 +171,6 @@ class Search:
         levels = self.levels
         # A small budget goes to the starts first.
         finals = min(self.finals, max(0, self.budget - len(levels) * len(self.spaces))) if self.task.own else 0
-        if self.workers is not None:
-            self.started = self.workers.pool.submit(prepare, self.task)
         alive, before = self._judge_starts(levels, finals, optimisers), -1
         while self._remaining(finals + round(_REFINED_SHARE * self.budget)) > 0 and alive and before < len(self.spent):
             before = len(self.spent)
@@ -231,6 +229,7 @@ class Search:
         starts = {space.kind: self._candidate(space, space.start) for space in self.spaces}
         if self.task.drawn:
             self._choose_draws(list(starts.values()))
+        started = self._start_workers(list(starts.values())[-1], levels[-1])
         self._judge(list(starts.values()), levels[0], finals)
         if not self.task.drawn:
             starts = self._move_starts(starts, finals + (len(levels) - 1) * len(starts))
@@ -238,6 +237,7 @@ class Search:
             self._judge(list(starts.values()), level, finals)
         if self.task.drawn:
             starts = self._judge_detuned(starts, levels, finals)
+        self.started = started  # until now these would have compiled the same functions
         self.dropped |= {kind: item.error for kind, item in starts.items() if item.error}
         for number, space in enumerate(self.spaces):
             if not np.array_equal(starts[space.kind].x, space.start):
@@ -354,6 +354,12 @@ class Search:
             self.spent.add(job)
             item.update(level, self.log.found[job])
         self._report_progress()
+
+    def _start_workers(self, item: Candidate, level: str) -> Future | None:
+        """Have the workers import, and compile or load, what the kind needs that has its turn last here."""
+        if self.workers is None:
+            return None
+        return self.workers.pool.submit(judge_candidate, self.task, item.kind, item.settings, level)
 
     def _started_workers(self) -> WorkerPool | None:
         """Return the workers once they have started; until then this process does all."""

@@ -13,7 +13,7 @@ import pytest
 
 from softneck.core import KINDS, SettingsError, resolve
 from softneck.runtime import _bundle as bundle_module
-from softneck.runtime import bundle, load_runtime
+from softneck.runtime import _compile, bundle, load_runtime
 from softneck.runtime._bundle import content_name
 from softneck.runtime._compile import _functions, _link_parts, _runtime, compiled_name, load_functions, load_linked
 
@@ -281,6 +281,36 @@ def test_inner_functions_are_linked_into_the_called_one_alone_and_raise_through_
     # Machine code is made, and kept, of what Python called.
     assert [path.name.split("-")[0].split(".")[-1] for path in (tmp_path / "cache").rglob("*.nbi")] == ["outer"]
     assert found.deep(x) == plain.deep(x)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="each process compiles for itself there")
+def test_a_function_that_another_process_compiles_is_waited_for_but_not_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runtime_folder: Path
+) -> None:
+    pytest.importorskip("numba")
+    import fcntl
+
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda *_a, **_k: str(tmp_path / "cache"))
+    (runtime_folder / "held_a_runtime.py").write_text("def outer(x):\n    return inner(x) + 1.0\n\n\n"
+                                                     "def inner(x):\n    return 2.0 * x\n")  # fmt: skip
+    assert load_functions("held_a_runtime").outer(3.0) == 7.0
+    (lock,) = (tmp_path / "cache").rglob("*.lock")
+    _functions.cache_clear()
+    with ThreadPoolExecutor(1) as pool:
+        with lock.open("a") as held:  # of an open file, so another of this process waits as another process would
+            fcntl.flock(held, fcntl.LOCK_EX)
+            found = load_functions("held_a_runtime")
+            waits = pool.submit(found.outer, 4.0)
+            with pytest.raises(TimeoutError):
+                waits.result(0.2)
+        assert waits.result() == 9.0
+    # What the other has compiled meanwhile is loaded.
+    assert sum(found.outer.stats.cache_hits.values()) == 1
+    monkeypatch.setattr(_compile, "_LONGEST_COMPILATION_S", 0.1)
+    _functions.cache_clear()
+    with lock.open("a") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert load_functions("held_a_runtime").outer(5.0) == 11.0
 
 
 def test_a_cache_folder_that_cannot_be_written_is_no_hindrance(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import hashlib
 import os
@@ -9,45 +10,65 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import softneck
-from softneck.core import load
+from softneck.core import SoftneckError, load
 from softneck.robot import Robot
 from softneck.runtime import cache_folder
 
 from .._main import GARBAGE_THRESHOLDS
-from ._plan import AUTO, FAMILY, PI, linear_model
+from ._plan import AUTO, FAMILY, KINDS_BESIDE_DRAWS, PI, linear_model
+
+if TYPE_CHECKING:
+    from softneck.identification import Family
+    from softneck.signals import Recording
+
+# Enough for a model of any kind; the names and sizes of what is compiled do not depend on them.
+_ROWS = 2000
 
 
 def compile_ahead(*recordings: str) -> None:
-    """Compile what the steps after the models call, in a process that no step waits for, with the lowest priority.
+    """Compile what the steps after the models call, in a process that no step waits for.
 
-    Run are an observer and the loops of one controller, over the model of the draws and over the best model if that is
-    nonlinear, when they are there, and the predictions of the report; the steps then load the functions from the cache.
+    Run are the loops of the first controllers and an observer over a family of few rows, then the loops over the best
+    model if that is nonlinear, and the predictions of the report; the steps then load the functions from the cache.
     """
-    from softneck import estimation, signals, tuning
+    from softneck import estimation, signals
 
-    getattr(os, "nice", int)(19)
     gc.set_threshold(*GARBAGE_THRESHOLDS)
-    family = _await(FAMILY)
-    observer = estimation.KalmanSettings().design(family)
-    fitted = estimation.fit_observer(observer, [signals.read_recording(name) for name in recordings], set())
-    estimation.consistency(fitted.observer, signals.read_recording(recordings[0]))
-    bare = replace(family, draws=None)  # with draws, margins would be those of 59
-    for model in [] if family.draws is None else [family.draws.model, None]:
-        if model is None:
-            _await(PI)
-            if linear_model() == AUTO:
-                break
-        task = tuning.task_of([bare, model or load(AUTO)], None, 0)
-        for level in reversed(tuning.LEVELS):  # margins first: the search needs their loops last
-            tuning.judge_candidate(task, "pi", {}, level)
-    _await(PI)  # the models are there then
     first = signals.read_recording(recordings[0])
+    family = _family_of(first.rows(0, _ROWS))
+    if family.draws is not None:
+        _judge_kinds(family, family.draws.model)
+    observer = estimation.KalmanSettings().design(family)
+    estimation.consistency(estimation.fit_observer(observer, [first], set()).observer, first)
+    _await(PI)  # the models are there then
+    if family.draws is not None and linear_model() != AUTO:
+        _judge_kinds(family, load(AUTO))
     for name in dict.fromkeys((AUTO, linear_model())):
         load(name).predict(first, 2)  # any horizon but one sample
     compiled_before().touch()
+
+
+def _family_of(few: Recording) -> Family:
+    """Return a family of few rows, or that of `start` where these tell too little."""
+    with contextlib.suppress(SoftneckError):
+        family = softneck.family(few, draws=1)
+        if family.draws is not None:
+            return family
+    return _await(FAMILY)
+
+
+def _judge_kinds(family: Family, model: Any) -> None:
+    """Judge the first candidates that `start` tunes, over one model."""
+    from softneck import tuning
+
+    bare = replace(family, draws=None)  # with draws, margins would be those of 59
+    task = tuning.task_of([bare, model], None, 0)
+    for kind in KINDS_BESIDE_DRAWS.split(","):
+        for level in reversed(tuning.LEVELS):  # margins first: the search needs their loops last
+            tuning.judge_candidate(task, kind, {}, level)
 
 
 def _await(name: str) -> Any:

@@ -83,7 +83,7 @@ _FMUS = (PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU)
 # necks `column`, `spring` and `chain`, and takes a fifth of a search with empty caches.
 _CONTROLLER_KINDS = "pi,pid,fopi,hinf,lqg"
 # Beside draws other kinds were not better: their feedforward sets the speed.
-_KINDS_BESIDE_DRAWS = "pi,hinf"
+KINDS_BESIDE_DRAWS = "pi,hinf"
 # With a family it gets no certificate: its loops pull no tendons as the recordings do.
 _KINDS_WITHOUT_FAMILY = ",mpc"
 _TUNED_LOOP, _REQUIREMENTS = "tune/loop.toml", "tune/requirements.toml"
@@ -250,7 +250,7 @@ def _controller(options: Options) -> Iterator[Step]:
     # Where draws decide, a nonlinear model that predicts worse than the linear one has no say.
     drawn = family and load(FAMILY).draws is not None
     plants = (linear, AUTO if drawn else plant) if family or nonlinear else (linear,)
-    kinds = _KINDS_BESIDE_DRAWS if drawn else _CONTROLLER_KINDS + _KINDS_WITHOUT_FAMILY * (not family)
+    kinds = KINDS_BESIDE_DRAWS if drawn else _CONTROLLER_KINDS + _KINDS_WITHOUT_FAMILY * (not family)
     kinds = options.kinds or kinds
     # Requirements of the user stay; infeasible defaults are left out, and the step fails.
     finding = possible(plants) if options.requirements is None else ""

@@ -20,7 +20,7 @@ import pytest
 
 import softneck
 from softneck.cli.start import _compile_ahead, _plan, _project_run, _start
-from softneck.core import CheckFailedError, OutputFileError, SettingsError
+from softneck.core import CheckFailedError, DataError, OutputFileError, SettingsError
 from softneck.robot import Robot
 
 from ...data import neck_recording
@@ -191,14 +191,16 @@ def test_functions_are_compiled_ahead_on_another_core_once_and_no_longer_than_th
     assert all(one.returncode for one in made), "it was ended"
 
 
+@pytest.mark.parametrize("few", ["explain", "have no draws", "are too few"])
 @pytest.mark.parametrize("nonlinear", [True, False])
 def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model_if_loops_are(
-    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nonlinear: bool
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nonlinear: bool, few: str
 ) -> None:
+    """The family is of few rows, before that of `start` is there; where they tell too little it waits for that one."""
     tuning, estimation = SimpleNamespace(LEVELS=("linear", "margins")), SimpleNamespace()
     ran: list[tuple[Any, ...]] = []
     tuning.task_of = lambda plants, *_: plants
-    tuning.judge_candidate = lambda task, _kind, _, level: ran.append((*task[1:], level, Path(_plan.PI).exists()))
+    tuning.judge_candidate = lambda task, kind, _, level: ran.append((*task[1:], kind, level, Path(_plan.PI).exists()))
     estimation.KalmanSettings = lambda: SimpleNamespace(design=lambda family: ran.append((family.draws.model,)))
     estimation.fit_observer = lambda *_: SimpleNamespace(observer=None)
     estimation.consistency = lambda *_: None
@@ -207,27 +209,47 @@ def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model_i
     def comes(_: float) -> None:
         asked.append(1.0)
         Path(_plan.PI).parent.mkdir(exist_ok=True)
-        Path(_plan.FAMILY if len(asked) == 1 else _plan.PI).touch()
+        Path(_plan.FAMILY if not Path(_plan.FAMILY).exists() and few != "explain" else _plan.PI).touch()
+
+    def family_of(rows: str, draws: int) -> Any:
+        assert (rows, draws) == ("log.csv to 2000", 1)
+        if few == "are too few":
+            raise DataError("record longer.")
+        return _Family() if few == "explain" else _Family(None)
 
     call("robot", "new", "robot.toml", "--preset", "neck")
     Path("models").mkdir()
     Path("models", f"auto_{'linear' if nonlinear else 'nonlinear'}.npz").touch()  # the best of the other sort
     monkeypatch.setattr(softneck, "tuning", tuning)
     monkeypatch.setattr(softneck, "estimation", estimation)
-    monkeypatch.setattr(_compile_ahead.os, "nice", int)
+    monkeypatch.setattr(softneck, "family", family_of)
     monkeypatch.setattr(_compile_ahead.time, "sleep", comes)
     monkeypatch.setattr(_compile_ahead, "cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(softneck.signals, "read_recording", lambda name: name)
+    monkeypatch.setattr(softneck.signals, "read_recording", _Rows)
     monkeypatch.setattr(_compile_ahead, "load", lambda name: _Family() if name == _plan.FAMILY else _Model(name, ran))
     monkeypatch.setattr(_compile_ahead.gc, "set_threshold", lambda *_: None)
     _compile_ahead.compile_ahead("log.csv")
     # The search needs the loops of margins last, so these are compiled first: then the two cores do different ones.
     auto = _Model("models/auto.npz", ran)
-    best = [(auto, "margins", True), (auto, "linear", True)] if nonlinear else []
+
+    def judged(model: Any, late: bool) -> list[tuple[Any, ...]]:
+        return [(model, kind, level, late) for kind in ("pi", "hinf") for level in ("margins", "linear")]
+
     # Last what the report predicts with: the best model and the best linear one.
     report = [("log.csv", "models/auto.npz"), *([("log.csv", "models/auto_linear.npz")] if nonlinear else [])]
-    assert ran == [("drawn",), ("drawn", "margins", False), ("drawn", "linear", False), *best, *report]
+    assert ran == [*judged("drawn", False), ("drawn",), *(judged(auto, True) if nonlinear else []), *report]
+    assert len(asked) == (1 if few == "explain" else 2)
     assert _compile_ahead.compiled_before().is_file()
+
+
+class _Rows(str):
+    """A recording by its name."""
+
+    __slots__ = ()
+
+    def rows(self, start: int, stop: int) -> str:
+        assert start == 0
+        return f"{self} to {stop}"
 
 
 @dataclass(frozen=True)
@@ -566,7 +588,6 @@ def test_a_long_refusal_is_noted_whole_and_ends_in_a_short_line(
     call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, stage: str
 ) -> None:
     from softneck.cli.start import _start
-    from softneck.core import DataError
 
     whole = f"models/a b.npz: no kind could be identified{', for one reason or another' * 8}. Look at 0.5 % of it."
 
