@@ -287,6 +287,16 @@ def least_rise(plant: AxisPlant, test: StepAndLoad, size: float | None = None) -
     return rise_time(y / (test.reference if size is None else size), dt)
 
 
+def bisect(
+    keeps: Callable[[float], bool], low: float, high: float, halvings: int, *, ratio: bool = False
+) -> tuple[float, float]:
+    """Halve the range from `low`, which keeps something, to `high`, which does not; `ratio`: at geometric means."""
+    for _ in range(halvings):
+        middle = math.sqrt(low * high) if ratio else 0.5 * (low + high)
+        low, high = (middle, high) if keeps(middle) else (low, middle)
+    return low, high
+
+
 def rise_time(y: Vector, dt: float) -> float:
     """Return the time [s] from 10 to 90 % of a response (n,) towards 1, between samples; inf if it never gets there."""
     times = []
@@ -310,9 +320,7 @@ def filter_for(rise: float, axis: AxisController, plant: AxisPlant, extra_delay:
     alone = _rise_time_with(ReferenceFilter(0.0), rise, axis, plant, extra_delay)
     if rise >= alone:
         guess = math.sqrt(max(rise**2 - alone**2, 0.0)) / LAG
-        return _bisect_filter(
-            lambda T: ReferenceFilter(T), 2.0 * guess + plant.sample_time, rise, axis, plant, extra_delay
-        )
+        return _bisect_filter(ReferenceFilter, 2.0 * guess + plant.sample_time, rise, axis, plant, extra_delay)
     T2 = rise / LAG
     most = ReferenceFilter(T2, _MAX_LEAD_RATIO * T2)
     if not math.isfinite(alone) or _rise_time_with(most, rise, axis, plant, extra_delay) > rise:
@@ -356,14 +364,10 @@ def _bisect_filter(
     extra_delay: int,
 ) -> ReferenceFilter:  # fmt: skip
     """Return make(T) for the T in 0..most with that rise, by halves: it rises the slower the larger T is."""
-    low, high = 0.0, most
-    for _ in range(_BISECTION_STEPS):
-        middle = 0.5 * (low + high)
-        if _rise_time_with(make(middle), rise, axis, plant, extra_delay) > rise:
-            high = middle
-        else:
-            low = middle
-    return make(0.5 * (low + high))
+    ends = bisect(
+        lambda T: _rise_time_with(make(T), rise, axis, plant, extra_delay) <= rise, 0.0, most, _BISECTION_STEPS
+    )
+    return make(0.5 * sum(ends))
 
 
 def _rise_time_with(

@@ -12,9 +12,9 @@ import numpy as np
 from softneck.core import Matrix, SettingsError
 
 from ..plants._coupled import AnyAxes, close_loop, radius, sensitivity
-from ._axis_loop import LOWEST, frequencies, rise_time
+from ._axis_loop import LOWEST, bisect, frequencies, rise_time
 from ._controller import LinearController, ReferenceFilter, assemble_law
-from ._settings import AxisSettings, _slowest_filter, reference_numbers
+from ._settings import AxisSettings, _slowest_filter, least_filter, reference_numbers
 
 # Steps are looked at for so many times the slowest time constant, dead time and filter.
 _STEP_WINDOW_RATIO = 8.0
@@ -113,10 +113,7 @@ def bisect_speed(keeps: Callable[[float], bool], low: float, high: float) -> flo
     """Bisect the largest speed from `low` to `high` that passes `keeps`, to 3 %; None if `low` fails."""
     if not keeps(low):
         return None
-    for _ in range(math.ceil(math.log2(math.log(high / low) / 0.03))):
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if keeps(middle) else (low, middle)
-    return low
+    return bisect(keeps, low, high, math.ceil(math.log2(math.log(high / low) / 0.03)), ratio=True)[0]
 
 
 def _steps(made: MultivariableDesign, plants: AnyAxes, extra_delay: int, time: float) -> Matrix:
@@ -146,17 +143,7 @@ def _least_filter(settings: AxisSettings, made: MultivariableDesign) -> float:
         peaks = [_steps(made, each, settings.extra_delay, samples * Ts).max() for each in made.samples]
         return max(peaks) <= 1.0 + settings.OVERSHOOT_PCT / 100.0
 
-    if keeps(low):
-        return low * Ts
-    if not keeps(high):
-        raise SettingsError(
-            f"no reference filter up to {high * Ts:g} s keeps the overshoot below {settings.OVERSHOOT_PCT:g} % on "
-            "every sample; lower `max_sensitivity`, or give `reference_time`."
-        )
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if keeps(middle) else (middle, high)
-    return high * Ts
+    return least_filter(keeps, low, high, Ts, settings.OVERSHOOT_PCT)
 
 
 def _filter_for(asked: float, made: MultivariableDesign, extra_delay: int) -> float:
@@ -173,8 +160,4 @@ def _filter_for(asked: float, made: MultivariableDesign, extra_delay: int) -> fl
             f"`rise_s` = {asked:g}: the loop rises in {own:.2g} s by itself; ask for more, or let the feedback be "
             "faster (`max_sensitivity`)."
         )
-    low, high = 0.0, asked
-    for _ in range(_BISECTION_STEPS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if rise(middle) < asked else (low, middle)
-    return low
+    return bisect(lambda time: rise(time) < asked, 0.0, asked, _BISECTION_STEPS)[0]

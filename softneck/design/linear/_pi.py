@@ -14,7 +14,7 @@ from softneck.estimation import AxisPlant
 from softneck.loop.default_limits import DESIGN_OVERSHOOT_PCT
 
 from ..plants._uncertain import UncertainAxis, UncertainPlant
-from ._axis_loop import LOWEST, axis_margins, coarse_frequencies, frequencies, unstable_samples
+from ._axis_loop import LOWEST, axis_margins, bisect, coarse_frequencies, frequencies, unstable_samples
 from ._controller import AxisController, ReferenceFilter, pi_axis
 from ._settings import PLANT, AxisDesign, AxisSettings, margins_json
 
@@ -84,12 +84,9 @@ class PiSettings(AxisSettings):
                 and found.phase * _GRID_TOLERANCE >= self.phase_margin
             )
 
-        low, high = 0.0, 1.0
-        if keeps(high):
+        if keeps(1.0):
             return gains
-        for _ in range(_REFINEMENT_STEPS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if keeps(middle) else (low, middle)
+        low, _ = bisect(keeps, 0.0, 1.0, _REFINEMENT_STEPS)
         if low == 0.0:
             raise SettingsError(
                 f"no PI gains keep Ms <= {self.max_sensitivity:g} and the phase margin around so light a mode; "

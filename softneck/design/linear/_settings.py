@@ -313,17 +313,7 @@ class AxisSettings(LoopSettings, ABC):
             return bool(sweep.run(controller, samples * axis.sample_time, L).overshoot.max() <= self.OVERSHOOT_PCT)
 
         low, high = _fastest_filter(axis.nominal), _slowest_filter(axis.nominal)
-        if keeps(low):
-            return low * axis.sample_time
-        if not keeps(high):
-            raise SettingsError(
-                f"no reference filter up to {high * axis.sample_time:g} s keeps the overshoot below "
-                f"{self.OVERSHOOT_PCT:g} % on every sample; lower `max_sensitivity`, or give `reference_time`."
-            )
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (low, middle) if keeps(middle) else (middle, high)
-        return high * axis.sample_time
+        return least_filter(keeps, low, high, axis.sample_time, self.OVERSHOOT_PCT)
 
     def _choose_conditioning(
         self, controller: AxisController, led: ReferenceFilter, axis: UncertainAxis
@@ -450,6 +440,25 @@ def axis_test(plant: AxisPlant, limits: ControllerLimits, inverse: Matrix) -> St
     # As large for this robot as 10 deg and -0.5 rad are for a neck, which they take 2 of 9 rad.
     asked = 2.0 / 9.0 * test.position_limit * abs(plant.static_gain)
     return replace(test, reference=asked, load=-0.5 / 9.0 * test.position_limit, size=test.reference / asked)
+
+
+def least_filter(keeps: Callable[[int], bool], low: int, high: int, sample_time: float, overshoot_pct: float) -> float:
+    """Return the smallest filter time [s] of `low` to `high` samples that keeps the overshoot.
+
+    Raises:
+        SettingsError: not even `high` does.
+    """
+    if keeps(low):
+        return low * sample_time
+    if not keeps(high):
+        raise SettingsError(
+            f"no reference filter up to {high * sample_time:g} s keeps the overshoot below {overshoot_pct:g} % on "
+            "every sample; lower `max_sensitivity`, or give `reference_time`."
+        )
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if keeps(middle) else (middle, high)
+    return high * sample_time
 
 
 def cocontraction_filter(filters: Sequence[ReferenceFilter]) -> ReferenceFilter:

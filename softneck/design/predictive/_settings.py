@@ -20,6 +20,7 @@ from softneck.core import (
 from softneck.estimation import ORDERS
 from softneck.robot import Robot, find_robot
 
+from ..linear._axis_loop import bisect
 from ..linear._ports import LIMITS, ControllerLimits
 from ..plants._coupled import AnyAxes, coupled_plant, radius, sensitivity
 from ..plants._uncertain import DEFAULT_SAMPLE_TIME_S, discretize_zoh, uncertain_plant
@@ -42,7 +43,6 @@ from ._plant import (
 from ._prediction import Problem, matrices
 from ._tuning import (
     FULL_TRUST,
-    bisect,
     filter_for_rise,
     guard_samples,
     judged_frequencies,
@@ -55,8 +55,8 @@ from ._tuning import (
     spaced_starts,
 )  # fmt: skip
 
-# All in scaled seconds. Bandwidths that are tried.
-_BANDWIDTH_RANGE = (1.0, 40.0)
+# All in scaled seconds. Bandwidths that are tried, to 2 %.
+_BANDWIDTH_RANGE, _BANDWIDTH_BISECTIONS = (1.0, 40.0), 7
 # Behind the dead time, in samples at most so many; moves in it.
 _HORIZON_S, _MAX_HORIZON, _MOVE_COUNT = 0.6, 200, 10
 _MAX_PREVIEW_S = 4.0
@@ -261,7 +261,7 @@ class MpcNumbers(MpcSettings):
                 f"({max(_WORST_SENSITIVITY, self.max_sensitivity):g} on the samples of a family); raise "
                 "`max_sensitivity`, or give `bandwidth`, with which less of what is measured is believed."
             )
-        return bisect(keeps, low, high)[0]
+        return bisect(keeps, low, high, _BANDWIDTH_BISECTIONS, ratio=True)[0]
 
     def _raise_bandwidth(self, plant: ScaledPlant, limits: ControllerLimits, nominal: AnyAxes, least: float) -> float:
         """Return the smallest bandwidth with which a step reaches the required rise time without a filter.
@@ -279,7 +279,7 @@ class MpcNumbers(MpcSettings):
         if not rises(high):
             asked = (self.rise_s or 0.0) * plant.scaling.second
             raise SettingsError(f"`rise_s` {asked:g} is faster than any plan of this plant rises; ask for more.")
-        return bisect(lambda bandwidth: not rises(bandwidth), low, high)[1]
+        return bisect(lambda bandwidth: not rises(bandwidth), low, high, _BANDWIDTH_BISECTIONS, ratio=True)[1]
 
     def _arrays(self, plant: ScaledPlant, limits: ControllerLimits, bandwidth: float) -> tuple[Any, ...]:
         problem = self.problem(plant, bandwidth)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, Vector, require_positive
 from softneck.estimation import AxisPlant
 
-from ..linear._axis_loop import frequencies
+from ..linear._axis_loop import bisect, frequencies, rise_time
 from ..plants._coupled import AnyAxes, AnyAxis, CoupledAxis, close_loop, radius, sensitivity
 from ._arrays import system, with_filter, with_gains
 
@@ -24,8 +24,6 @@ _WEIGHT_DECADES = (-6.0, 6.0)
 _MIN_TRUST, FULL_TRUST = 1e-4, 1e3
 _BISECTION_STEPS = 18
 _FREQUENCY_DECIMATION = 5
-# Of a range of 40: to 2 %.
-_BANDWIDTH_BISECTIONS = 7
 # A step response is judged over this long.
 _STEP_WINDOW_S = 4.0
 # With 180 a sample of 20 ms was over before half of the answers came, with 90 none of them took a tenth of it.
@@ -37,14 +35,6 @@ _MOVE_SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
 def judged_frequencies(nominal: Pair) -> Vector:
     """Return the frequencies [rad/s] of Ms: 5 % apart, so that a peak is missed by less than 1 %."""
     return frequencies(nominal[0].sample_time)[::_FREQUENCY_DECIMATION]
-
-
-def bisect(keeps: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
-    """Bisect the range from `low`, which keeps something, to `high`, which does not, until it is 2 % wide."""
-    for _ in range(_BANDWIDTH_BISECTIONS):
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if keeps(middle) else (low, middle)
-    return low, high
 
 
 def require_positive_settings(settings: Any, units: Mapping[str, str]) -> None:
@@ -61,14 +51,8 @@ def move_weight(plant: AnyAxis, bandwidth: float) -> float:
     output hardly shows nothing is asked: no weight moves them.
     """
     plant = plant.lag() if isinstance(plant, CoupledAxis) else plant.remove_hidden_poles()
-    low, high = _WEIGHT_DECADES
-    for _ in range(_BISECTION_STEPS):
-        middle = 0.5 * (low + high)
-        if _slowest(plant, 10.0**middle) > math.exp(-bandwidth * plant.sample_time):
-            high = middle
-        else:
-            low = middle
-    return float(10.0**low)
+    slowest = math.exp(-bandwidth * plant.sample_time)
+    return float(10.0 ** bisect(lambda x: _slowest(plant, 10.0**x) <= slowest, *_WEIGHT_DECADES, _BISECTION_STEPS)[0])
 
 
 def _slowest(plant: AxisPlant, weight: float) -> float:
@@ -110,17 +94,14 @@ def observer_trust(
     def keeps(trust: float) -> bool:
         return keeps_bounds(with_gains(arrays, trust), families, extra_delay, frequency)
 
-    low, high = math.log(_MIN_TRUST), math.log(FULL_TRUST)
     if keeps(FULL_TRUST):
         return FULL_TRUST
     if not keeps(_MIN_TRUST):
         raise SettingsError(
             "no observer keeps the requested robustness; ask for less `bandwidth` or more `max_sensitivity`."
         )
-    for _ in range(_BISECTION_STEPS // 2 + 2):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if keeps(math.exp(middle)) else (low, middle)
-    return math.exp(low)
+    low, high = math.log(_MIN_TRUST), math.log(FULL_TRUST)
+    return math.exp(bisect(lambda x: keeps(math.exp(x)), low, high, _BISECTION_STEPS // 2 + 2)[0])
 
 
 def rise(arrays: tuple[Matrix, ...], pair: Pair, extra_delay: int) -> float:
@@ -133,31 +114,17 @@ def rise(arrays: tuple[Matrix, ...], pair: Pair, extra_delay: int) -> float:
     for k in range(rows):
         x = A @ x + B
         y[k] = np.diag(C @ x)
-    return max(_crossed(path, 0.9) - _crossed(path, 0.1) for path in y.T) * Ts
-
-
-def _crossed(path: Vector, level: float) -> float:
-    """Return where a response first reaches a level [samples], between samples."""
-    above = np.flatnonzero(path >= level)
-    if not above.size:
-        return math.inf
-    k = int(above[0])
-    before = float(path[k - 1]) if k else 0.0
-    return k - (float(path[k]) - level) / (float(path[k]) - before)
+    return max(rise_time(path, Ts) for path in y.T)
 
 
 def filter_for_rise(arrays: tuple[Matrix, ...], pair: Pair, extra_delay: int, asked: float) -> float:
     """Return the time constant [s] of the reference filter for the required rise time [s]; 0 where it does
     not even without."""
-    low, high = 0.0, asked
-    if rise(with_filter(arrays, 0.0), pair, extra_delay) >= asked:
-        return 0.0
-    for _ in range(_BISECTION_STEPS):
-        middle = 0.5 * (low + high)
-        # A filter that answers so late that nothing rises within what is looked at is too slow as well.
-        quick = rise(with_filter(arrays, middle), pair, extra_delay) < asked
-        low, high = (middle, high) if quick else (low, middle)
-    return low
+
+    def is_quick(time: float) -> bool:
+        return rise(with_filter(arrays, time), pair, extra_delay) < asked
+
+    return bisect(is_quick, 0.0, asked, _BISECTION_STEPS)[0] if is_quick(0.0) else 0.0
 
 
 def guard_samples(bandwidth: float, sample_time: float) -> int:
