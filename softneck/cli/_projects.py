@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck import plots
-from softneck.core import CheckFailedError, OutputFileError, atomic_write, refuse_existing
+from softneck.core import CheckFailedError, OutputFileError, refuse_existing, write_text
 
 from .shared._console import Stages, note, print_json, print_table, progress
 from .shared._options import common_options, target
@@ -45,8 +45,7 @@ def new(folder: Path, loop_file: Path | None, force: bool, as_json: bool) -> Non
             "writes the project into this one and replaces files of the same names."
         )
     for name, text in texts.items():
-        with atomic_write(folder / name, force=force) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(folder / name, text, force=force)
     if as_json:
         print_json({"folder": str(folder), "files": list(texts)})
         return

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck import plant
-from softneck.core import SettingsError, atomic_write, settings_text
+from softneck.core import SettingsError, settings_text, write_text
 
 from .shared._console import print_json
 from .shared._groups import NearGroup, now
@@ -77,8 +77,7 @@ def new(file: Path, preset: str, force: bool, as_json: bool) -> None:
         raise SettingsError(f"{file}: must end in `.toml`, by which softneck recognises the file.")
     taken = preset not in ROBOT_PRESETS and Path(preset).is_file()
     text = _text_for_folder(Path(preset), file.parent) if taken else preset_text(preset)
-    with atomic_write(file, force=force) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(file, text, force=force)
     if as_json:
         print_json({"file": str(file), "preset": preset})
         return

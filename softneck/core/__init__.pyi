@@ -70,6 +70,7 @@ from ._files import require_steps as require_steps
 from ._files import require_table as require_table
 from ._files import require_unpacked as require_unpacked
 from ._files import settings_text as settings_text
+from ._files import write_text as write_text
 from ._kinds import fitting as fitting
 from ._kinds import kinds_of as kinds_of
 from ._kinds import make_settings as make_settings

@@ -19,7 +19,7 @@ from softneck import __version__
 
 from ._display import ReprMixin
 from ._errors import CheckFailedError, FileFormatError
-from ._files import MOST_JSON, atomic_write, file_hash, settings_text
+from ._files import MOST_JSON, file_hash, settings_text, write_text
 
 CERTIFICATE_VERSION = 1
 # The commands that write certificates.
@@ -100,8 +100,7 @@ def write_certificate(path: str | Path, contents: Mapping[str, Any], *, force: b
     Raises:
         OutputFileError: the file exists (and not `force`) or cannot be written.
     """
-    with atomic_write(path, force=force) as temporary:
-        temporary.write_text(json.dumps(contents, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(contents, indent=2, allow_nan=False) + "\n", force=force)
 
 
 def read_certificate(path: str | Path) -> Certificate:

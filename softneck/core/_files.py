@@ -236,6 +236,12 @@ def atomic_write(path: str | Path, *, force: bool = False) -> Iterator[Path]:
         os.close(descriptor)
 
 
+def write_text(path: str | Path, text: str, *, force: bool = False) -> None:
+    """Write a text as `atomic_write` does."""
+    with atomic_write(path, force=force) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def _resolve_link(path: Path) -> Path:
     """Return the target of a symbolic link, whether or not it exists; raise OSError if links form a circle."""
     target = Path(os.path.realpath(path)) if path.is_symlink() else path

@@ -19,10 +19,10 @@ from softneck.core import (
     ReprMixin,
     SettingsError,
     Vector,
-    atomic_write,
     one_blas_thread,
     require_whole,
     silent,
+    write_text,
 )
 from softneck.signals import Recording
 
@@ -93,8 +93,7 @@ class Calibration(ReprMixin):
                 f"the best neck follows the runs to {fits} % (pitch/roll), less than {LEAST_FIT:g}: not written. Give "
                 "the payloads, more `evaluations`, or verify on a `greybox` model instead."
             )
-        with atomic_write(path, force=force) as temporary:
-            temporary.write_text(self.toml(), encoding="utf-8")
+        write_text(path, self.toml(), force=force)
 
 
 @one_blas_thread

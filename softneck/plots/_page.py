@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from softneck.core import ReprMixin, atomic_write, percent
+from softneck.core import ReprMixin, percent, write_text
 
 from ._chart import Chart, Curve
 from ._interactive import LICENCE, draw, gzip_base64, library
@@ -118,8 +118,7 @@ def _file(name: str) -> str:
 
 def write_page(path: str | Path, html: str, *, force: bool = False) -> None:
     """Write a page atomically; raise OutputFileError if it exists (and not `force`) or cannot be written."""
-    with atomic_write(path, force=force) as temporary:
-        temporary.write_text(html, encoding="utf-8")
+    write_text(path, html, force=force)
 
 
 # Samples of a page: about three bytes each when compressed, four as text.

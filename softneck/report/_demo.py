@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softneck.core import OutputFileError, SettingsError, atomic_write
+from softneck.core import OutputFileError, SettingsError, write_text
 from softneck.cosim import Result
 from softneck.identification import INFINITE, Model
 from softneck.plant import NeckParameters, VirtualNeck
@@ -152,8 +152,7 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
 def _write_results(demo: Demo, tell: Tell) -> None:
     tell("write the report")
     out = demo.settings.out
-    with atomic_write(out / "results" / "summary.json", force=True) as temporary:
-        temporary.write_text(json.dumps(demo.as_dict(), indent=2) + "\n", encoding="utf-8")
+    write_text(out / "results" / "summary.json", json.dumps(demo.as_dict(), indent=2) + "\n", force=True)
     sentence, holds = verdict(demo.packaged, demo.loops)
     html = page(
         "From a recording to a verified closed loop", _sections(demo), verdict=sentence, holds=holds,

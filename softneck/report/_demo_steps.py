@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softneck.core import Matrix, Progress, atomic_write
+from softneck.core import Matrix, Progress, write_text
 from softneck.cosim import Result, load_loop, simulate, simulate_fmu
 from softneck.design import LinearController, PiSettings
 from softneck.estimation import KalmanObserver, KalmanSettings
@@ -186,8 +186,7 @@ def close_loops(folder: Path, *, sample_time: float, tell: Tell) -> dict[str, Re
         text = _LOOP_TOML.format(
             name=name, sample_time=sample_time, pitch=pitch, roll=roll, limits=_limits(pitch, roll)
         )
-        with atomic_write(path, force=True) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(path, text, force=True)
 
         def progress(done: float, number: int = number, name: str = name) -> None:
             report((number + done) / len(_STEPS), name)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tomli_w
 
-from softneck.core import atomic_write, file_hash, write_certificate
+from softneck.core import file_hash, write_certificate, write_text
 from softneck.design import assumed_lines
 from softneck.loop import error_unit
 from softneck.plots import GREY, Chart, Curve, Panel, Section, Table, cell, curve_styles, page, write_page
@@ -53,7 +53,7 @@ def write_tuned(found: Tuned, folder: Path, plants: Mapping[str, Path]) -> dict[
     if found.observer is not None:
         found.observer.save(folder / OBSERVER, force=True)
     requirements = folder / "requirements.toml"
-    _write(requirements, tomli_w.dumps(_toml_table(found.task.asked.table)))
+    write_text(requirements, tomli_w.dumps(_toml_table(found.task.asked.table)), force=True)
     read = {"controller": folder / BEST, "requirements": requirements, **files}
     verification = replace(
         found.verification, files={role: (str(path), file_hash(path)) for role, path in read.items()}
@@ -66,8 +66,8 @@ def write_tuned(found: Tuned, folder: Path, plants: Mapping[str, Path]) -> dict[
         certificate.unlink(missing_ok=True)
     _write_loop(found, folder, steps or _write_drawn(found, folder))
     values = tuned_values(found, folder / BEST)
-    _write(folder / "pareto.json", json.dumps(values["pareto"], indent=1) + "\n")
-    _write(folder / "pareto.csv", _csv(found))
+    write_text(folder / "pareto.json", json.dumps(values["pareto"], indent=1) + "\n", force=True)
+    write_text(folder / "pareto.csv", _csv(found), force=True)
     write_page(folder / "report.html", tune_page(found), force=True)
     certified = tune_decision(found, tuner=None)
     write_page(folder / TUNER, tuner_page(found, folder, plants, certified=certified), force=True)
@@ -161,17 +161,12 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
     words = "" if found.observed else (
         "\n# Without observer.npz: with it steps fail a requirement or rise later, or none was designed."
     )  # fmt: skip
-    _write(folder / LOOP, f"# The best of `softneck tune` over {name}.{words}\n{tomli_w.dumps(table)}")
+    write_text(folder / LOOP, f"# The best of `softneck tune` over {name}.{words}\n{tomli_w.dumps(table)}", force=True)
 
 
 def _toml_table(table: Mapping[str, Any]) -> dict[str, Any]:
     """Return a requirements table as TOML values, without empty tables."""
     return {key: dict(value) if isinstance(value, Mapping) else value for key, value in table.items() if value != {}}
-
-
-def _write(path: Path, text: str) -> None:
-    with atomic_write(path, force=True) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 _MAX_FRONT_ROWS = 30

@@ -17,7 +17,7 @@ from typing import IO, Any
 
 import platformdirs
 
-from softneck.core import atomic_write
+from softneck.core import write_text
 
 from ._bundle import bundle, content_name
 from ._numba_cache import compile_without_failing_cache, numba_cache_name
@@ -249,8 +249,7 @@ def _import_text(text: str, *, compiled: bool) -> ModuleType:
     path = cache_folder() / f"{name}.py"
     # numba compiles again when a file is written again.
     if not path.is_file() or path.read_text(encoding="utf-8", errors="replace") != text:
-        with atomic_write(path, force=True) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(path, text, force=True)
     alias = f"{name}_compiled" if compiled else name
     spec = importlib.util.spec_from_file_location(alias, path)
     if spec is None or spec.loader is None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import Matrix, SettingsError, Vector, atomic_write, to_si
+from softneck.core import Matrix, SettingsError, Vector, to_si, write_text
 from softneck.loop import error_unit
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
@@ -147,7 +147,7 @@ def write_linear(
     text = _PLANT_TEMPLATE.format(**named, axes=inputs, more=more)
     # Python imports a module name once, so each plant has its own.
     module = f"plant_{hashlib.sha256(text.encode()).hexdigest()[:10]}"
-    _write(folder / f"{module}.py", text, force=True)
+    write_text(folder / f"{module}.py", text, force=True)
     Ts, duration = float(worst["sample_time"]), float(step["duration_s"])
     stepped = around + asked.scale.si(float(step["size_deg"])) * (np.arange(around.size) == worst["axis"])
     if before.any():
@@ -164,7 +164,7 @@ def write_linear(
         parameters=noise, controller=controller, observer=None, wanted=wanted,
         duration=duration, sample_time=Ts, order="sequential",
     )  # fmt: skip
-    _write(folder / f"{name}.toml", text, force=force)
+    write_text(folder / f"{name}.toml", text, force=force)
     return folder / f"{name}.toml"
 
 
@@ -181,7 +181,7 @@ def write_neck(
         observer=observer, wanted=_step(robot, ends, worst["at_s"]),
         duration=worst["duration_s"], sample_time=worst["sample_time_s"], order=worst["order"],
     )  # fmt: skip
-    _write(folder / f"{name}.toml", text, force=force)
+    write_text(folder / f"{name}.toml", text, force=force)
     return folder / f"{name}.toml"
 
 
@@ -215,8 +215,3 @@ def _toml_path(path: Path, folder: Path) -> str:
     """Return the path from `folder` as a TOML text."""
     relative = Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
     return '"' + relative.replace("\\", "\\\\").replace('"', '\\"') + '"'
-
-
-def _write(path: Path, text: str, *, force: bool) -> None:
-    with atomic_write(path, force=force) as temporary:
-        temporary.write_text(text, encoding="utf-8")

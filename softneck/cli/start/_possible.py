@@ -14,7 +14,7 @@ import numpy as np
 import tomli_w
 
 from softneck import signals, tuning, verification
-from softneck.core import OutputFileError, SettingsError, atomic_write, to_si
+from softneck.core import OutputFileError, SettingsError, to_si, write_text
 from softneck.robot import OPTIONAL_KEYS, ROBOT_KEYS, Robot
 from softneck.signals import Recording
 
@@ -82,9 +82,8 @@ def possible(plants: tuple[str, ...]) -> str:
     if refused:
         said = "".join(f"# {why}\n" for why in refused.values())
         table = {"version": 1, "require": dict.fromkeys(refused, False)}
-        with atomic_write(FILE, force=True) as temporary:
-            head = f"# The defaults of `softneck tune` that cannot be are left out:\n{said}"
-            temporary.write_text(head + tomli_w.dumps(table), encoding="utf-8")
+        head = f"# The defaults of `softneck tune` that cannot be are left out:\n{said}"
+        write_text(FILE, head + tomli_w.dumps(table), force=True)
     return " ".join(refused.values())
 
 
@@ -170,8 +169,7 @@ def _add(file: Path, name: str, entries: dict[str, Entry]) -> None:
     except ValueError:  # the table stood in another form, such as `sensor.delay_s = 0.1`
         values = table.get(name, {}) | {key: value for key, (value, *_) in entries.items()}
         text = tomli_w.dumps(table | {name: values})
-    with atomic_write(file, force=True) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(file, text, force=True)
 
 
 def _limits(robot: Robot, recordings: Sequence[Recording]) -> dict[str, Entry]:

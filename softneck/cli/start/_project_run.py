@@ -26,10 +26,10 @@ from softneck.core import (
     OutputFileError,
     SettingsError,
     SoftneckError,
-    atomic_write,
     core_count,
     file_hash,
     settings_text,
+    write_text,
 )
 
 from ..shared._console import note
@@ -76,8 +76,7 @@ class ProjectRun:
     def write(self) -> None:
         """Write the finished steps."""
         content = {"format": _FORMAT_VERSION, "asked": self.answers, "steps": self.done}
-        with atomic_write(FILE, force=True) as temporary:
-            temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        write_text(FILE, json.dumps(content, indent=1) + "\n", force=True)
 
     def do(self, step: Step) -> None:
         """Run a step unless it is finished; its result is in `done`."""

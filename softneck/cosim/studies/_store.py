@@ -26,6 +26,7 @@ from softneck.core import (
     error_reason,
     require_table,
     settings_text,
+    write_text,
 )
 
 from ..loops._loop_parts import OBJECT
@@ -53,8 +54,7 @@ class Store:
         else:
             self._runs.unlink(missing_ok=True)
             text = json.dumps(_description(study), indent=2) + "\n"
-            with atomic_write(folder / STUDY_FILE, force=True) as temporary:
-                temporary.write_text(text, encoding="utf-8")
+            write_text(folder / STUDY_FILE, text, force=True)
         self.done = set(self.finish()["run"].tolist())
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -289,8 +289,7 @@ def write_worst(study: Study, runs: pd.DataFrame, folder: str | Path, *, count: 
         remark = f"# Run {number} of study {study.name}" + (f"; it failed: {error}" if error else ".")
         text = f"{remark}\n" + tomli_w.dumps({"folder": Path(start).as_posix(), **table})
         path = target / f"run_{number:05d}.toml"
-        with atomic_write(path, force=True) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(path, text, force=True)
         paths.append(path)
     return paths
 

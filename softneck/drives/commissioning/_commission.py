@@ -15,10 +15,10 @@ from softneck.core import (
     CheckFailedError,
     OutputFileError,
     SettingsError,
-    atomic_write,
     refuse_existing,
     require_whole,
     to_si,
+    write_text,
 )
 from softneck.plant import NeckParameters
 from softneck.robot import Robot
@@ -220,6 +220,5 @@ def write_files(folder: Path, result: Commissioned, *, force: bool) -> dict[str,
     # All in memory before the first is written.
     texts = {DRIVES: tomli_w.dumps(drives_table(result.file)), ROBOT: tomli_w.dumps(result.robot.as_dict())}
     for name, text in texts.items():
-        with atomic_write(folder / name, force=force) as temporary:
-            temporary.write_text(_FILE_HEAD + text, encoding="utf-8")
+        write_text(folder / name, _FILE_HEAD + text, force=force)
     return {Path(name).stem: str(folder / name) for name in texts}

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from softneck.core import MOST_JSON, FileFormatError, SettingsError, atomic_write, settings_text
+from softneck.core import MOST_JSON, FileFormatError, SettingsError, settings_text, write_text
 
 _KIND, _VERSION = "softneck supervision", 3
 _LATER = {"seconds", "tracking"}
@@ -110,8 +110,7 @@ class Baseline:
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the baseline as JSON; an existing file is replaced only with `force`."""
         text = json.dumps({"kind": _KIND, "version": _VERSION, **asdict(self)}, indent=1)
-        with atomic_write(path, force=force) as part:
-            part.write_text(text + "\n", encoding="utf-8")
+        write_text(path, text + "\n", force=force)
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Baseline:
