@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +24,7 @@ from softneck.core import (
     open_zip,
     read_archive,
     read_certificate,
+    read_toml,
     refuse_existing,
     require_file,
     settings_text,
@@ -234,10 +234,7 @@ def _toml(file: Path) -> dict[str, Any]:
     """Describe a TOML file by its keys: robot, loop, study, layout, otherwise a neck."""
     from softneck.robot import Robot
 
-    try:
-        table = tomllib.loads(settings_text(file))
-    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, thousands of digits or brackets
-        raise FileFormatError(f"{file}: is not a TOML file ({error}).") from error
+    table = read_toml(file)
     if table.keys() & {"motors", "outputs", "directions", "extends"}:
         robot = Robot.read(file)
         return {"type": "robot", "robot": robot.name, "hash": robot.hash, "summary": robot.summary()}

@@ -62,6 +62,8 @@ from ._files import MOST_UNPACKED as MOST_UNPACKED
 from ._files import as_path as as_path
 from ._files import largest_unpacked as largest_unpacked
 from ._files import open_zip as open_zip
+from ._files import read_toml as read_toml
+from ._files import refuse_unknown as refuse_unknown
 from ._files import remove_abandoned as remove_abandoned
 from ._files import require_file as require_file
 from ._files import require_numbers as require_numbers

@@ -13,10 +13,12 @@ import hashlib
 import os
 import re
 import secrets
+import tomllib
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from ._errors import FileFormatError, OutputFileError, SettingsError
 
@@ -305,11 +307,33 @@ def as_path(thing: object) -> Path:
     return Path(thing)
 
 
-def require_file(path: str | Path) -> None:
-    """Raise FileFormatError if `path` does not exist or is a folder."""
+def require_file(path: str | Path, hint: str = "") -> None:
+    """Raise FileFormatError if `path` does not exist or is a folder; the line ends with `hint`."""
     if not Path(path).is_file():
         what = "is a folder; name a file in it" if Path(path).is_dir() else "no such file"
-        raise FileFormatError(f"{path}: {what}.")
+        raise FileFormatError(f"{path}: {what}{hint and '; '}{hint}.")
+
+
+def read_toml(path: str | Path, hint: str = "") -> dict[str, Any]:
+    """Return the content of a TOML file; `hint` says what to give instead of a file that is missing.
+
+    Raises:
+        FileFormatError: no such file, or no TOML.
+    """
+    require_file(path, hint)
+    try:
+        return tomllib.loads(settings_text(path))
+    except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, thousands of digits or brackets
+        raise FileFormatError(f"{path}: is not valid TOML ({error}).") from error
+    except OSError as error:
+        raise FileFormatError(f"{path}: cannot be read: {error.strerror}.") from error
+
+
+def refuse_unknown(where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
+    """Raise SettingsError if `table` has a key that is not `known`."""
+    unknown = [key for key in table if key not in known]
+    if unknown:
+        raise SettingsError(f"unknown key `{unknown[0]}` of {where}; it takes {', '.join(known)}.")
 
 
 def file_hash(path: str | Path) -> str:

@@ -25,7 +25,6 @@ from .loops._loop_file import find_python as find_python
 from .loops._loop_file import is_loop_file as is_loop_file
 from .loops._loop_file import reference_of as reference_of
 from .loops._loop_file import require_trusted as require_trusted
-from .loops._loop_parts import read_toml as read_toml
 from .loops._simulate import describe_excess_range as describe_excess_range
 from .loops._simulate import run_setup as run_setup
 from .parts._variables import interfaces_of as interfaces_of

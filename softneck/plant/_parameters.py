@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,9 @@ from softneck.core import (
     ReprMixin,
     SettingsError,
     Vector,
+    read_toml,
     require_between,
     require_one_of,
-    settings_text,
 )
 from softneck.runtime import Port
 
@@ -174,14 +173,7 @@ class NeckParameters(ReprMixin):
             SettingsError: a value outside its range.
         """
         source = Path(path)
-        try:
-            content = tomllib.loads(settings_text(source))
-        except OSError as error:
-            raise FileFormatError(
-                f"{source}: cannot be read ({error.strerror}); use {', '.join(PRESETS)} or a neck file (.toml)."
-            ) from error
-        except (ValueError, RecursionError) as error:
-            raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
+        content = read_toml(source, f"use {', '.join(PRESETS)} or a neck file (.toml)")
         preset = content.pop("preset", "paper")
         if not isinstance(preset, str) or preset not in PRESETS:
             raise FileFormatError(f"{source}: `preset` must be one of {', '.join(PRESETS)}; got {preset!r}.")

@@ -27,6 +27,7 @@ from softneck.core import (
     load,
     open_zip,
     read_archive,
+    read_toml,
     required_rows,
     settings_text,
     silent,
@@ -38,7 +39,6 @@ from softneck.cosim import (
     load_loop,
     read_runs,
     read_study_description,
-    read_toml,
     simulate,
 )
 from softneck.identification import INFINITE, Rules, bandwidth_of, judge, judged_parts

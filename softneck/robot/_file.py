@@ -11,7 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from softneck.core import FileFormatError, SettingsError, SoftneckError, did_you_mean, require_one_of, settings_text
+from softneck.core import SettingsError, SoftneckError, did_you_mean, require_one_of
 
 from ._channels import Directions, Motors, Outputs
 
@@ -62,20 +62,6 @@ _IN_UNIT = {
 # Keys for the size and speed of motions: a robot with directions of its own does not inherit them.
 _OF_DIRECTIONS = (("", "time_constant_s"), *((table, key) for table in ("motors", "outputs")
                                              for key in ("nominal", "rest")))  # fmt: skip
-
-
-def read_table(path: Path) -> dict[str, Any]:
-    """Return the tables of a TOML file.
-
-    Raises:
-        FileFormatError: no such file, or not TOML.
-    """
-    try:
-        return tomllib.loads(settings_text(path))
-    except FileNotFoundError as error:
-        raise FileFormatError(f"{path}: no such robot file; `softneck robot new {path}` writes one.") from error
-    except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, thousands of digits or brackets
-        raise FileFormatError(f"{path}: is not a TOML file ({error}).") from error
 
 
 def preset_text(name: str) -> str:

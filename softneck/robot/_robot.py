@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, ReprMixin, SettingsError, Vector, require_positive, to_si
+from softneck.core import Matrix, ReprMixin, SettingsError, Vector, read_toml, require_positive, to_si
 
 from . import _file
 from ._channels import Directions, Motors, Outputs, motor_channels, parse_numbered
@@ -148,7 +148,7 @@ class Robot(ReprMixin):
             FileFormatError: no such file, or not TOML.
             SettingsError: a wrong key or value; the message names it.
         """
-        table = _file.read_table(Path(path))
+        table = read_toml(path, f"`softneck robot new {path}` writes one")
         with _file.prefix_errors(path):
             return cls(**_file.fields(table), file=Path(path))
 

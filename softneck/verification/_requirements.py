@@ -15,9 +15,9 @@ from softneck.core import (
     ReprMixin,
     SettingsError,
     did_you_mean,
+    read_toml,
     require_between,
     require_whole,
-    settings_text,
     sim_name,
     to_si,
 )
@@ -276,13 +276,7 @@ def default_text() -> str:
 
 
 def _read(source: Path) -> dict[str, Any]:
-    try:
-        table = tomllib.loads(settings_text(source))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
-    except OSError as error:
-        hint = "name a requirements file (.toml)."
-        raise FileFormatError(f"{source}: cannot be read ({error.strerror}); {hint}") from error
+    table = read_toml(source, "name a requirements file (.toml)")
     if table.get("version") != VERSION:
         raise FileFormatError(
             f"{source}: `version` must be {VERSION}, the version of requirements that this softneck reads; "

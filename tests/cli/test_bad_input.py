@@ -162,7 +162,7 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
         (("import", "REC", "--layout", "none.toml"), "none.toml: no such file"),
         (("info", "neck.xyz"), "neck.xyz: no such file"),
         (("record", "song", "-o", "r.csv"), "`signal` must be one of eq22"),
-        (("record", "steps", "-o", "r.csv", "--neck", "giraffe"), "giraffe: cannot be read"),
+        (("record", "steps", "-o", "r.csv", "--neck", "giraffe"), "giraffe: no such file"),
         (("record", "steps", "-o", "r.csv", "--payload", "-1"), "`--payload` must be between 0 and 1 [kg]"),
         (("record", "steps", "-o", "r.csv", "--duration", "0"), "`duration` must be between 0.02 and 86400 [s]"),
         (("record", "eq22", "-o", "r.csv", "--duration", "0.001"), "r"),

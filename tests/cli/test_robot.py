@@ -52,7 +52,7 @@ def test_bad_robots_are_one_line_and_exit_code_2(call: Call, tmp_path: Path) -> 
     )
     assert "the virtual plant has motors in rad or deg, and `motors.unit` of robot `b`" in call("robot").error
     (tmp_path / "robot.toml").write_text('extends = "neck"\n[plant]\nneck = "n.toml"\n')
-    assert "n.toml: cannot be read" in call("robot").error
+    assert "n.toml: no such file" in call("robot").error
     (tmp_path / "robot.toml").write_text('extends = "neck"\n[motor]\nunit = "deg"\n')
     said = call("info", "robot.toml")
     assert (said.code, "unknown key `motor`; did you mean `motors`?" in said.error) == (2, True)

@@ -177,7 +177,7 @@ def test_nobody_is_told_to_loosen_a_margin() -> None:
         (["--requirements", "{folder}/fast.toml"], "within the motors' slew and range"),
         (["--kinds", ""], "unknown kind of controller ``"),
         (["--kinds", "pie"], "unknown kind of controller `pie`"),
-        (["--requirements", "{folder}/none.toml"], "cannot be read"),
+        (["--requirements", "{folder}/none.toml"], "no such file"),
         (["-o", "{folder}/wanted.toml"], "is a file; name a folder"),
         (["--budget", "0"], "0 is not in the range"),
         (["--observer", str(MODEL)], "is a model (oe), not"),

@@ -77,7 +77,7 @@ def test_a_bad_file_is_refused_by_its_name(tmp_path: Path, text: str, what: str)
 
 
 def test_a_missing_file_is_named() -> None:
-    with pytest.raises(FileFormatError, match=re.escape("nowhere.toml: cannot be read")):
+    with pytest.raises(FileFormatError, match=re.escape("nowhere.toml: no such file")):
         NeckParameters.preset("nowhere.toml")
 
 

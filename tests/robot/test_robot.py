@@ -183,9 +183,9 @@ def test_without_a_preset_a_table_that_is_missing_is_named(tmp_path: Path) -> No
 
 
 def test_what_is_no_file_or_no_toml_is_said(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match="no such robot file; `softneck robot new"):
+    with pytest.raises(FileFormatError, match="no such file; `softneck robot new"):
         Robot.read(tmp_path / "absent.toml")
-    with pytest.raises(FileFormatError, match="is not a TOML file"):
+    with pytest.raises(FileFormatError, match="is not valid TOML"):
         Robot.read(written(tmp_path, "[[["))
     with pytest.raises(SettingsError, match="`trunk5` is neither a robot preset"):
         find_robot("trunk5")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -11,7 +10,7 @@ from math import isclose
 from pathlib import Path
 
 from softneck import signals
-from softneck.core import MOST_TOML, SettingsError, load, settings_text
+from softneck.core import MOST_TOML, load, read_toml
 from softneck.robot import Robot
 
 from ..shared._console import note
@@ -287,10 +286,7 @@ def _fmus(plant: str, options: Options) -> list[Step]:
 
 def uses_observer() -> bool:
     """Return whether `tune` found the loop better with an observer."""
-    try:
-        return "observer" in tomllib.loads(settings_text(_TUNED_LOOP))
-    except (OSError, ValueError) as error:
-        raise SettingsError(f"{_TUNED_LOOP}: is not the loop that `softneck tune` wrote ({error}).") from error
+    return "observer" in read_toml(_TUNED_LOOP)
 
 
 def _loops(options: Options) -> Iterator[Step]:
@@ -302,7 +298,7 @@ def _loops(options: Options) -> Iterator[Step]:
                   reads=("test_closed_loop.py", "loop.toml", *_FMUS))] if options.tested else []  # fmt: skip
     page, certificate = "build/loop.html", "loop.certificate.json"
     command = ("softneck", "simulate", "loop.toml", "-o", "results/loop.csv", "--html", page, "--force")
-    if "limits" in tomllib.loads(settings_text("loop.toml")):
+    if "limits" in read_toml("loop.toml"):
         command += ("--certificate", certificate)
     yield Step(stage="loop", command=command, makes=("results/loop.csv", page), reads=("loop.toml", *_FMUS),
                beside=tuple(tests))  # fmt: skip

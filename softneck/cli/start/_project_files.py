@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
-from softneck.core import FileFormatError, SettingsError, settings_text, to_si
+from softneck.core import FileFormatError, SettingsError, read_toml, to_si
 from softneck.robot import Robot, find_robot
 
 from ._plan import CONTROLLER_FMU, OBSERVER_FMU, PLANT_FMU
@@ -43,10 +42,7 @@ def _text(package: str, name: str) -> str:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        table = tomllib.loads(settings_text(path))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: is not a TOML file ({error}).") from error
+    table = read_toml(path)
     if not all(isinstance(table.get(part), dict) for part in ("plant", "controller", "reference")):
         raise FileFormatError(f"{path}: is no loop file: [plant], [controller] and [reference] are needed.")
     if table["reference"].get("kind") != "step":

@@ -15,6 +15,8 @@ from softneck.core import (
     SettingsError,
     SoftneckError,
     file_hash,
+    read_toml,
+    refuse_unknown,
     require_one_of,
     require_steps,
 )
@@ -24,7 +26,7 @@ from softneck.robot import Robot, find_robot
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
 from ..ssp._read import StructureTable, read_ssp
-from ._loop_parts import OBJECT, PRESETS, SOURCES, PartOpener, links, number, numbers, read_toml, refuse_unknown, tables
+from ._loop_parts import OBJECT, PRESETS, SOURCES, PartOpener, links, number, numbers, tables
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load, require_file, settings_text
+from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load, refuse_unknown
 from softneck.design import own_object
 from softneck.loop import AheadReference, BlockPart, Link, Part, RecordingReference, Reference, make_reference
 from softneck.plant import PRESETS, NeckParameters, VirtualNeck
@@ -21,24 +20,6 @@ from softneck.signals import read_recording, require_same_robot
 
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
-
-
-def read_toml(source: Path) -> dict[str, Any]:
-    """Return the content of a TOML file; raise FileFormatError if it cannot be read."""
-    require_file(source)
-    try:
-        return tomllib.loads(settings_text(source))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
-    except OSError as error:
-        raise FileFormatError(f"{source}: cannot be read: {error.strerror}.") from error
-
-
-def refuse_unknown(where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
-    """Raise SettingsError if `table` has a key that is not `known`."""
-    unknown = [key for key in table if key not in known]
-    if unknown:
-        raise SettingsError(f"unknown key `{unknown[0]}` of {where}; it takes {', '.join(known)}.")
 
 
 def number(name: str, value: Any) -> float:

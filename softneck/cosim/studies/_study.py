@@ -15,14 +15,23 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import FileFormatError, Matrix, ReprMixin, SettingsError, SoftneckError, file_hash
+from softneck.core import (
+    FileFormatError,
+    Matrix,
+    ReprMixin,
+    SettingsError,
+    SoftneckError,
+    file_hash,
+    read_toml,
+    refuse_unknown,
+)
 from softneck.design import own_attributes, own_object
 from softneck.loop import Loop, LoopRun, error_unit, metric_names, reference_field
 from softneck.robot import Robot, find_robot
 from softneck.runtime import Block
 
 from ..loops._loop_file import LoopSetup, load_loop, make_loop, normal_table
-from ..loops._loop_parts import OBJECT, SOURCES, PartOpener, read_toml, refuse_unknown
+from ..loops._loop_parts import OBJECT, SOURCES, PartOpener
 from ..loops._loop_table import check_key, loop_table, set_sources, settable, with_values
 
 VARY_KINDS = ("grid", "uniform", "log_uniform", "normal", "choices", "seed")

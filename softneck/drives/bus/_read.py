@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from softneck.core import DataError, FileFormatError, SettingsError, settings_text
+from softneck.core import DataError, FileFormatError, SettingsError, read_toml, refuse_unknown
 from softneck.robot import Robot
 from softneck.signals import NECK
 
@@ -36,12 +35,7 @@ def load_drives(path: str | Path, robot: str | Path | Robot | None = None) -> Dr
             winches; the line names table and key.
     """
     source = Path(path)
-    try:
-        table = tomllib.loads(settings_text(source))
-    except OSError as error:
-        raise FileFormatError(f"{source}: cannot be read ({error.strerror}).") from error
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
+    table = read_toml(source)
     try:
         return make_drives(table, source.parent, robot_of(robot, source))
     except (SettingsError, DataError, FileFormatError) as error:
@@ -89,7 +83,7 @@ _GONE: dict[str, dict[str, float]] = {
 def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | None = None) -> DrivesFile:
     """Return the drives file of a table for `robot`; `folder` holds the files that it names."""
     table = require_table(table, robot)
-    _refuse_unknown("the file", table, _TOP_KEYS)
+    refuse_unknown("the file", table, _TOP_KEYS)
     if "profile" not in table:
         raise SettingsError(f"`profile` is missing; it is one of {', '.join(PROFILES)}.")
     entries, motors = table.get("drive"), len((robot or NECK).motors.names)
@@ -112,7 +106,7 @@ def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | 
     values |= _values("[stop]", "quick", _table("stop", table.get("stop", {})))
     if "supervision" in table:
         content = _table("supervision", table["supervision"])
-        _refuse_unknown("[supervision]", content, ("baseline",))
+        refuse_unknown("[supervision]", content, ("baseline",))
         if not isinstance(content.get("baseline"), str):
             raise SettingsError(
                 "[supervision] `baseline` must name the file that `softneck.drives.baseline(...).save` wrote."
@@ -134,7 +128,7 @@ def _drive(number: int, entry: Any) -> DriveEntry:
     where = f"[[drive]] {number}"
     content = dict(_table(where, entry))
     known = {**_KEYS["scale"], **_KEYS["drive"]}
-    _refuse_unknown(where, content, tuple(known))
+    refuse_unknown(where, content, tuple(known))
     for key in ("node", "peak_current_A"):
         if key not in content:
             raise SettingsError(f"{where}: `{key}` is missing.")
@@ -157,7 +151,7 @@ def _build(where: str, setting: type, name: str, content: Mapping[str, Any]) -> 
 
 def _values(where: str, name: str, content: Mapping[str, Any]) -> dict[str, Any]:
     keys = _KEYS[name]
-    _refuse_unknown(where, content, tuple(keys))
+    refuse_unknown(where, content, tuple(keys))
     return {keys[key][0]: _value(f"{where} {key}", value, keys[key][1]) for key, value in content.items()}
 
 
@@ -193,12 +187,6 @@ def _table(name: str, value: Any) -> Mapping[str, Any]:
         ):
             raise SettingsError(f"[{name}] {key} is no setting any more, but always {constant:g}; leave it out.")
     return {key: setting for key, setting in value.items() if key not in _GONE.get(name, {})}
-
-
-def _refuse_unknown(where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
-    unknown = [key for key in table if key not in known]
-    if unknown:
-        raise SettingsError(f"unknown key `{unknown[0]}` of {where}; it takes {', '.join(known)}.")
 
 
 def drives_table(file: DrivesFile) -> dict[str, Any]:

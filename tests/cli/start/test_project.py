@@ -108,7 +108,7 @@ def test_what_is_no_such_loop_makes_nothing(call: Call, change: dict[str, Any], 
     assert says in said.error
     assert not Path("p").exists()
     Path("tuned.toml").write_text("= no", encoding="utf-8")
-    assert "is not a TOML file" in call("new", "p", "--loop", "tuned.toml").error
+    assert "is not valid TOML" in call("new", "p", "--loop", "tuned.toml").error
 
 
 def test_a_robot_file_in_another_folder_names_the_same_files(call: Call, tmp_path: Path) -> None:
