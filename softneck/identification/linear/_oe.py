@@ -6,6 +6,7 @@ run, are projected out (Golub and Pereyra 2003; Ljung 1999, sec. 10.2). Derivati
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,7 +28,7 @@ from softneck.core import (
 from softneck.signals import Recording, assess_quality
 
 from ..models._drive import fit_drive
-from ..models._fitting import MAX_DELAY, ScaledData, delay_samples, free_run_fit, training_recording
+from ..models._fitting import MAX_DELAY, ScaledData, best_delay, delay_samples, free_run_fit, training_recording
 from ..models._linear_systems import axes_system, lss_arrays
 from ..models._model import Model
 from ._regression import (
@@ -390,10 +391,11 @@ class OutputError:
         columns = [(y[:, None], u[:, None]) for u, y in runs]
         outputs = np.concatenate([y[np.isfinite(y)] for _, y in runs])
         spread = float(np.sum((outputs - outputs.mean()) ** 2))
-        best: tuple[OutputErrorFit, int] | None = None
+        fits: dict[int, OutputErrorFit] = {}
         curve: list[list[float]] = []
         last: list[Vector] = []
-        for d in delay_samples(self.delay, self.max_delay or MAX_DELAY, sample_time, columns):
+
+        def cost(d: int) -> float:
             Phi, Y = arx_rows(columns, self._poles, self._numerator, d)
             require_excitation(name, Phi)
             arx = np.linalg.lstsq(Phi, Y[:, 0])[0]
@@ -402,20 +404,20 @@ class OutputError:
             starts = [*last, arx[: self._poles]] if last else others
             fit = fit_output_error(runs, self._poles, self._numerator, d, starts, constant=constant)
             if fit is None:
-                continue
-            last = [fit.f]
+                return math.inf
+            fits[d], last[:] = fit, [fit.f]
             one_step = Y[:, 0] - Phi @ np.concatenate([fit.f, fit.b])
             percent = 100.0 * (1.0 - np.sqrt(fit.cost / spread))
             curve.append([d * sample_time, percent, float(np.sqrt(np.mean(one_step**2)))])
-            if best is None or fit.cost < best[0].cost:
-                best = (fit, d)
-        if best is None:
+            return fit.cost
+
+        d = best_delay(delay_samples(self.delay, self.max_delay or MAX_DELAY, sample_time, columns), cost)
+        if not fits:
             raise DataError(f"no dead time gives a stable model of {name}; record with more excitation.")
-        d = best[1]
-        starts = [best[0].f, *start, *default_starts(self._poles, sample_time, None)]
+        starts = [fits[d].f, *start, *default_starts(self._poles, sample_time, None)]
         again = fit_output_error(runs, self._poles, self._numerator, d, starts, constant=constant)
-        fit = again if again is not None and again.cost < best[0].cost else best[0]
-        return fit, d, curve, _least_squares_findings(columns, self._poles, self._numerator, d, sample_time)
+        fit = again if again is not None and again.cost < fits[d].cost else fits[d]
+        return fit, d, sorted(curve), _least_squares_findings(columns, self._poles, self._numerator, d, sample_time)
 
     def _intervals(
         self, sample_time: float, runs: list[tuple[Vector, Vector]], fit: OutputErrorFit, delay: int

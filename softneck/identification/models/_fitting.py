@@ -6,7 +6,7 @@ All is scaled and rounded before anything is learned, so that neither units nor 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -101,6 +100,8 @@ def _mix(x: np.ndarray) -> np.ndarray:
 
 # Default end of the search for the dead time [scaled s]: one and a half time constants.
 MAX_DELAY = 0.3
+# Dead times that are all tried; of more a grid of as many, and finer ones.
+_MOST_DELAYS = 32
 
 
 def delay_samples(
@@ -117,6 +118,23 @@ def delay_samples(
             "lower `delay` or record longer."
         )
     return [samples]
+
+
+def best_delay(delays: Sequence[int], cost: Callable[[int], float]) -> int:
+    """Return the dead time of the least cost, the first of equal ones.
+
+    Of more than `_MOST_DELAYS` a grid is tried, then a finer one around its best: the cost of a motion that is sampled
+    so fast turns slowly from one sample of dead time to the next.
+    """
+    known: dict[int, float] = {}
+    while True:
+        stride = -(-len(delays) // _MOST_DELAYS)
+        known |= {d: cost(d) for d in delays[::stride] if d not in known}
+        best = min(sorted(known), key=lambda d: (math.isnan(known[d]), known[d]))
+        if stride == 1:
+            return best
+        at = delays.index(best)
+        delays = delays[max(0, at - stride + 1) : at + stride]
 
 
 def free_run_fit(runs: Sequence[tuple[Matrix, Matrix]], a: Vector, B: Matrix, d: int) -> float:

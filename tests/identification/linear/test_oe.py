@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any, cast
 
@@ -9,12 +10,15 @@ import control
 import numpy as np
 import pytest
 import scipy.signal as dsp
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from softneck.core import DataError, SettingsError, load
 from softneck.identification import OutputError, Rls, choose, validate
 from softneck.identification.linear._oe import fit_output_error
+from softneck.identification.models._fitting import best_delay
 from softneck.identification.models._linear_systems import axis_functions, continuous_parameters
 from softneck.robot import Robot
 from softneck.signals import Recording, concatenate, import_log, read_layout, redefine, signal
@@ -94,6 +98,28 @@ def test_the_dead_time_is_the_least_of_its_whole_curve() -> None:
         curve = np.array(model.findings["delay_curve"][name])
         np.testing.assert_allclose(curve[:, 0], np.arange(11) * TS, atol=1e-12)
         assert curve[:, 1].argmax() == model.arrays["delay"][axis] == TRUTH.delay[axis]
+
+
+@given(st.integers(1, 3000), st.integers(0, 2999), st.floats(0.3, 3.0))
+def test_of_many_dead_times_the_best_is_found_by_few_trials(count: int, best: int, power: float) -> None:
+    """A cost with one minimum; up to 32 all are tried, in their order."""
+    best %= count
+    tried: list[int] = []
+
+    def cost(d: int) -> float:
+        tried.append(d)
+        return abs(d - best) ** power
+
+    assert best_delay(range(count), cost) == best
+    assert len(tried) == len(set(tried)) <= 100  # a grid of 32, then twice as many finer ones at most
+    if count <= 32:
+        assert tried == list(range(count))
+
+
+def test_of_equal_dead_times_the_first_is_taken_and_one_without_a_cost_never() -> None:
+    costs = [math.nan, 2.0, 1.0, math.inf, 1.0, math.nan]
+    assert best_delay(range(6), costs.__getitem__) == 2
+    assert best_delay([4], lambda _: math.inf) == 4
 
 
 def test_runs_have_starts_of_their_own() -> None:
