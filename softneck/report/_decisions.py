@@ -151,4 +151,4 @@ def project_decision(models: Sequence[Values], certificates: Sequence[Values], *
     )
     if not verified:
         return " ".join(said)
-    return " ".join([*said, certificate_decision(verified[0], tuner=tuner), *verified[0]["draws"]])
+    return " ".join([*said, certificate_decision(verified[0], tuner=tuner)])

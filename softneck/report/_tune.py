@@ -331,8 +331,8 @@ def _steps(found: Tuned, items: Sequence[Candidate]) -> Chart:
 
 def _front(found: Tuned) -> Section:
     rows = [
-        [item.kind, *(cell(item.metrics[name], ".3g") for name in found.objectives),
-         ", ".join(f"{name} {cell(value, '.3g')}" for name, value in item.settings.items())]
+        [item.kind, ", ".join(f"{name} {cell(value, '.3g')}" for name, value in item.settings.items()),
+         *(cell(item.metrics[name], ".3g") for name in found.objectives)]
         for item in found.front[:_MAX_FRONT_ROWS]
     ]  # fmt: skip
     more = len(found.front) - _MAX_FRONT_ROWS
@@ -342,7 +342,7 @@ def _front(found: Tuned) -> Section:
         "above, has more plants.",
     ]
     text += [f"The first {_MAX_FRONT_ROWS} by {found.objectives[0]}."] if more > 0 else []
-    return Section("Pareto front", text=text, tables=[Table("", ["kind", *found.objectives, "settings"], rows)])
+    return Section("Pareto front", text=text, tables=[Table("", ["kind", "settings", *found.objectives], rows, text=2)])
 
 
 def _plants_of_search(found: Tuned) -> str:

@@ -55,11 +55,13 @@ def verdict_values(rows: Sequence[Values]) -> dict[str, Any]:
     return {"requirements": len(rows), "failed": failed, "undecided": open_}
 
 
-def certificate_decision(one: Values, *, tuner: str | None = None) -> str:
+def certificate_decision(one: Values, *, tuner: str | None = None, judged: str = "") -> str:
     """Return the decision on a controller: what it holds, or why not to run it, and what to do next.
 
-    `one`: as from `certificate_values`. `tuner`: path of `tuner.html`, if there.
+    `one`: as from `certificate_values`. `tuner`: path of `tuner.html`, if there. `judged`: by what, in a sentence.
     """
+    facts = " ".join(filter(None, [judged, *one.get("draws", ())]))
+    facts += " " * bool(facts)
     count, name = one["requirements"], one["controller"] or "The controller"
     name = f"{name} ({one['kind']})" if one["kind"] else name
     trade = "" if tuner is None else f"open {tuner} to trade speed for caution"
@@ -76,9 +78,9 @@ def certificate_decision(one: Values, *, tuner: str | None = None) -> str:
             file = one["controller"] or "CONTROLLER"
             way = f"export it for your own computer (`softneck fmu {file} --backend compiled`: an FMU, C inside)"
         more = f", or {trade}" if trade else ""
-        return f"{name} holds {holds} requirements of {one['file']}{rest}. Next: {way}{more}."
+        return f"{name} holds {holds} requirements of {one['file']}{rest}. {facts}Next: {way}{more}."
     if not one["failed"]:
-        return f"Do not run {name} yet: no requirement was judged."
+        return f"Do not run {name} yet: no requirement was judged. {facts}".rstrip()
     failing = "; ".join(_requirement(row) for row in one["failed"][:2])
     more = f" and {len(one['failed']) - 2} more" if len(one["failed"]) > 2 else ""
     # A safety margin is never loosened, and what was not computed holds at no limit.
@@ -88,7 +90,7 @@ def certificate_decision(one: Values, *, tuner: str | None = None) -> str:
     way = "take a kind with a linear form, such as pi or lqg" if blind else way
     return (
         f"Do not run {name} yet: {len(one['failed'])} of {count} requirements fail: {failing}{more}. "
-        f"Next: {way}, or record another motion and start with both logs{'; ' + trade if trade else ''}."
+        f"{facts}Next: {way}, or record another motion and start with both logs{'; ' + trade if trade else ''}."
     )
 
 

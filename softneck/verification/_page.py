@@ -242,7 +242,7 @@ def verification_decision(contents: Mapping[str, Any], certificate: str) -> str:
     values = certificate_values(certificate or "its certificate", contents)
     plants, loops = contents["plants"]["count"], contents["virtual_neck_loops"]
     judged = f"Judged against {plants} linear plants and in {loops} simulated loops."
-    return " ".join([certificate_decision(values), judged, *values["draws"]])
+    return certificate_decision(values, judged=judged)
 
 
 def _requirements_section(found: Verification, certificate: str, stepped: Chart) -> Section:

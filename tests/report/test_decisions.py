@@ -216,9 +216,11 @@ def test_a_project_decides_on_model_controller_and_next_step() -> None:
         "tune/best.npz (hinf) holds all 1 requirements of best.certificate.json. Next: run it on drives with that "
         "certificate (`softneck drives --help`), or open tune/tuner.html to trade speed for caution."
     )
-    # What loops over draws say, with the doubt about them, comes last.
+    # What loops over draws say, with the doubt about them, comes before what to do next.
     drawn = certificate_values("best.certificate.json", {**certificate(0), "draws": [{"statement": "2 of 59 fail"}]})
-    assert project_decision(models, [drawn], tuner="tune/tuner.html") == f"{said} Of its draws: 2 of 59 fail."
+    assert project_decision(models, [drawn], tuner="tune/tuner.html") == said.replace(
+        "Next:", "Of its draws: 2 of 59 fail. Next:"
+    )
     # A robot in pressures has no CANopen drives: its controller is exported.
     pressures = {**certificate(0), "units": ["kPa", "deg"]}
     said = project_decision([], [certificate_values("c.json", pressures)], tuner=None)
