@@ -887,6 +887,8 @@ def test_a_costly_kind_goes_on_only_as_the_best() -> None:
         for kind, m in (("a", 0.2), ("b", 0.5), (costly, value)):
             search.candidates[kind, ""] = of_kind(kind, m)
         assert [space.kind for space in search._drop_kinds(search.spaces)] == kept
+        # Of two kinds none is dropped.
+        assert len(search._drop_kinds(search.spaces[:2])) == 2
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,8 @@ _FMUS = (PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU)
 _CONTROLLER_KINDS = "pi,pid,fopi,hinf,lqg"
 # Beside draws other kinds were not better: their feedforward sets the speed.
 KINDS_BESIDE_DRAWS = "pi,hinf"
+# Evaluations of `tune` without and with draws, where six necks and robots rise as fast as after 60.
+_BUDGETS = (60, 40)
 # With a family it gets no certificate: its loops pull no tendons as the recordings do.
 _KINDS_WITHOUT_FAMILY = ",mpc"
 _TUNED_LOOP, _REQUIREMENTS = "tune/loop.toml", "tune/requirements.toml"
@@ -99,7 +101,7 @@ class Options:
         kinds: of controllers to search; None: those of `tune` but `adaptive`.
         sample_time: of logs without a clock [s].
         motors, positions, outputs: columns of the logs that were named; () for a guess.
-        budget: of `tune`: by default half its own, so that a run ends within minutes.
+        budget: of `tune`; None: 40 evaluations beside draws, else 60.
         seed: of kinds of models and of the search.
         yes: take all guesses.
         backend: of the FMUs.
@@ -114,7 +116,7 @@ class Options:
     motors: Sequence[str] = ()
     positions: Sequence[str] = ()
     outputs: Sequence[str] = ()
-    budget: int = 60
+    budget: int | None = None
     seed: int = 0
     yes: bool = False
     backend: str = "compiled"
@@ -256,7 +258,7 @@ def _controller(options: Options) -> Iterator[Step]:
     stated = FILE if finding else options.requirements
     wanted = () if stated is None else (stated,)
     words = [word for name, value in (("--requirements", stated), ("--kinds", kinds),
-                                      ("--budget", options.budget), ("--seed", options.seed))
+                                      ("--budget", options.budget or _BUDGETS[drawn]), ("--seed", options.seed))
              if value is not None for word in (name, str(value))]  # fmt: skip
     # --force continues the same search, and replaces another one.
     command = ("softneck", "tune", *plants, *words, "--observer", OBSERVER, "-o", "tune", "--force")

@@ -67,7 +67,9 @@ _FIRST_SENTENCE = re.compile(r"(?:[^:]*\.(?:csv|npz): )?((?s:.*?)[^.\s]\.)(?=\s+
 @click.option("--requirements", type=_PATH, metavar="TOML", help="Requirements for `tune`. [default: its own]")
 @click.option("--kinds", metavar="K,K", help="Kinds of controller to search. [default: those of `tune` but `adaptive`]")
 @click.option("--sample-time", metavar="S", help="Of logs without a clock. [default: as the log tells]")
-@click.option("--budget", type=click.IntRange(min=1), metavar="EVALUATIONS", help="Of `tune`. [default: 60]")
+@click.option(
+    "--budget", type=click.IntRange(min=1), metavar="EVALUATIONS", help="Of `tune`. [default: 40; without draws 60]"
+)
 @click.option("--seed", type=click.IntRange(min=0), help="Of models and search. [default: 0]")
 @columns_options
 @common_options("robot", "yes")

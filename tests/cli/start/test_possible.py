@@ -178,6 +178,9 @@ def test_a_family_that_cannot_be_made_is_done_without_and_none_of_other_recordin
         beside = next(_plan._controller(Options(logs=())))
         kinds = "pi,hinf" if draws else "pi,pid,fopi,hinf,lqg"
         assert beside.command[2:6] == (_plan.FAMILY, f"models/{second}", "--kinds", kinds)
+        assert beside.command[6:8] == ("--budget", "40" if draws else "60")
+        asked = next(_plan._controller(Options(logs=(), budget=7)))
+        assert asked.command[6:8] == ("--budget", "7")
         plant = beside.beside[0].command[2]
         assert plant == ("models/auto_nonlinear.npz" if other == "nonlinear" else "models/auto.npz")
         for path in others:
