@@ -349,7 +349,7 @@ class Search:
             judged = item.level == level or item.error or job in self.spent
             if not judged and len(wanted) < self._remaining(reserved):
                 wanted.setdefault(job, item)
-        run_jobs([job for job in wanted if job not in self.log.found], self._call, self._store, self._started_workers())
+        run_jobs([job for job in wanted if job not in self.log.found], self._call, self._store, self._started_workers)
         for job, item in wanted.items():
             self.spent.add(job)
             item.update(level, self.log.found[job])
@@ -382,12 +382,13 @@ class Search:
 
 def run_jobs(
     jobs: Sequence[Job], call: Callable[[Job], Callable[[], Judgement]], took: Callable[[Job, Judgement], None],
-    workers: WorkerPool | None,
+    started: Callable[[], WorkerPool | None],
 ) -> None:  # fmt: skip
-    """Run jobs, one here and two per worker at a time, and store each result when it arrives."""
+    """Run jobs, one here and two per worker that has `started` at a time, and store each result when it arrives."""
     left, out = list(jobs)[::-1], dict[Future, Job]()
     try:
         while left or out:
+            workers = started()
             while workers is not None and len(left) > 1 and len(out) < 2 * workers.size:
                 job = left.pop()
                 out[workers.pool.submit(call(job))] = job

@@ -934,7 +934,7 @@ def test_nothing_is_judged_twice_nor_after_an_error_nor_beyond_the_budget(
     search.spent = {jobs["e"]}
     found[jobs["f"]] = Judgement({"m": 0.7})
 
-    def judge(wanted: Any, call: Any, took: Any, workers: Any) -> None:
+    def judge(wanted: Any, call: Any, took: Any, started: Any) -> None:
         for job in wanted:
             run.append(json.loads(job.settings)["k"])
             took(job, Judgement({"m": 0.5}))

@@ -233,14 +233,14 @@ def test_work_is_given_out_two_to_a_worker_and_all_of_it_comes_back(monkeypatch:
 
     monkeypatch.setattr(_search, "cores_taken", cores_taken)
     workers: Any = SimpleNamespace(size=size, pool=SimpleNamespace(submit=submit)) if size else None
-    run_jobs(jobs, lambda job: lambda: job.settings, took, workers)  # pyright: ignore[reportArgumentType, reportReturnType]
+    run_jobs(jobs, lambda job: lambda: job.settings, took, lambda: workers)  # pyright: ignore[reportArgumentType, reportReturnType]
     assert sorted(back, key=lambda pair: pair[1]) == [(job, job.settings) for job in jobs]
     # The better ones stand first: a search that is stopped has judged those.
     assert (given, here) == (sorted(given), sorted(here))
     assert len(here) == len(taken) == 9 - len(given)
     assert bool(given) == bool(size)
     # A single one is not given away: this process would wait for it.
-    run_jobs(jobs[:1], lambda job: lambda: job.settings, took, workers)  # pyright: ignore[reportArgumentType, reportReturnType]
+    run_jobs(jobs[:1], lambda job: lambda: job.settings, took, lambda: workers)  # pyright: ignore[reportArgumentType, reportReturnType]
     assert (here[-1], taken[-1]) == ("0", 0)
 
 
@@ -250,7 +250,7 @@ def test_a_worker_that_dies_ends_a_search_with_what_to_do() -> None:
 
     worker: Any = SimpleNamespace(size=1, pool=SimpleNamespace(submit=submit))
     with pytest.raises(SoftneckError, match=r"a worker process died .*; run the same command again"):
-        run_jobs([Job("pi", "", "all")] * 2, lambda _: dict, lambda *_: None, worker)  # pyright: ignore[reportArgumentType]
+        run_jobs([Job("pi", "", "all")] * 2, lambda _: dict, lambda *_: None, lambda: worker)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("kind", [*KINDS_SEARCHED, "nmpc"])
