@@ -57,7 +57,7 @@ def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     plants = dict(list(PLANTS.items())[: 1 if request.param == "linear" else 2])
     asked = {**ASKED, "require": {"step.rise_s": {"max": 1.2}}} if request.param == "linear" else ASKED
     named = {name: str(path) for name, path in plants.items()}
-    budget = 10 if request.param == "linear" else 22
+    budget = 10 if request.param == "linear" else 30
     found = tune(named, asked, kinds=("pi",), budget=budget, workers=0, folder=folder)
     values = write_tuned(found, folder, plants)
     return Made(found, folder, values, packed_data((folder / "tuner.html").read_text()))

@@ -367,6 +367,6 @@ def test_the_page_is_drawn_in_full(browser: Any, held: Verification, tmp_path: P
         count = sum(verdict.holds is True for verdict in held.verdicts)
         said = view.page.locator(".verdict").inner_text()
         assert said == verification_decision(held.contents(), "pi.certificate.json")
-        assert said.startswith(f"The controller (pi) holds all {count} requirements of pi.certificate.json. Next: ")
+        assert said.startswith(f"The controller (pi) holds all {count} requirements of pi.certificate.json. Judged ")
         assert view.pixels(0, 0, "#000000") > 50, "the nominal loop of the first Bode panel"
         assert not math.isnan(view.x_range(0)[0])

@@ -21,13 +21,15 @@ def serve(
     bus: Any,
     neck: SimulatedDrives,
     *,
+    stopped: Callable[[], bool] | None = None,
     report: Callable[[float, SimulatedDrives, int], None] | None = None,
 ) -> None:
-    """Answer frames on `bus` and advance the plant, until the process ends.
+    """Answer frames on `bus` and advance the plant, until `stopped` returns True.
 
     Args:
         bus: an open bus of python-can.
         neck: drives and plant; of more than two outputs the first two are sent.
+        stopped: called in each cycle.
         report: called with (monotonic time, neck, row) whenever the drive in that row changes its power state.
     """
     import can
@@ -44,7 +46,7 @@ def serve(
                 if report is not None:
                     report(time.monotonic(), neck, row)
 
-    while True:
+    while stopped is None or not stopped():
         now = time.monotonic() - begin
         while moved * cycle <= now:
             neck.move()
