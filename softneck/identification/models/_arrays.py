@@ -29,7 +29,8 @@ _LOADED_GREYBOX = "softneck.identification.structured._loaded_greybox_runtime"
 VALIDITY = ("ground", "doubt")
 # Files also leave out the offset of a robot that rests at zero, and a body of constant stiffness without creep.
 _OPTIONAL = (*VALIDITY, "offset", "body")
-_RIGID = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1e4])
+# In the order of BODY_*; drives of any speed.
+RIGID = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1e4, 0.0, 1.0])
 
 
 def without_validity(arrays: Mapping[str, Matrix]) -> dict[str, Matrix]:
@@ -45,10 +46,10 @@ def runtime_arrays(kind: str, arrays: Mapping[str, Matrix]) -> dict[str, Matrix]
     motors = len(own["drive"]) if "drive" in own else int(history[2]) if len(history) > 2 else 3
     empty = {
         "ground": np.zeros((0, 1 + 2 * motors)), "doubt": np.zeros((outputs, 3)), "offset": np.zeros(outputs),
-        "body": _RIGID,
+        "body": RIGID,
     }  # fmt: skip
     if "body" in own:  # of an earlier version it lacks the last numbers
-        own = {**own, "body": np.append(own["body"], _RIGID[own["body"].size :])}
+        own = {**own, "body": np.append(own["body"], RIGID[own["body"].size :])}
     names = _names(_module_of(kind, arrays))
     found = {name: own[name] if name in own else empty[name] for name in names}
     for number, (member, part) in enumerate(members(arrays)):

@@ -2,7 +2,8 @@
 
 Lengths of tendon are in radians of motor, tensions in radians of stretch, so that no stiffness appears twice.
 
-- drive: m_j lags its delayed set-point, not faster than `top_speed`, and stops where its tension reaches `pull_limit`;
+- drive: m_j lags its delayed set-point, not faster than `top_speed`, up to a tension of (1 - drag) `pull_limit`, from
+  where it gets on to `pull_limit` at `drag_rate`, as friction falls with the speed; drag may be zero;
 - stretch: x_j = pretension + m_j - lever (e_j . (b - home)) - arc |b|^2 - s, tension T_j = max(0, x_j): a tendon only
   pulls, and the plates that a bent link carries are nearer to each other (of an arc of length L by L |b|^2 / 24);
 - bend: b' = gain sum T_j (e_j + 2 arc / lever b) - stiffness F (1 +- asymmetry) (b - rest) - stiffening |b|^2 b
@@ -73,6 +74,8 @@ BODY_HOME = 10  # two
 BODY_SLOW_CREEP = 12
 BODY_SLOW_CREEP_RATE = 13
 BODY_TOP_SPEED = 14
+BODY_DRAG = 15
+BODY_DRAG_RATE = 16
 # The largest bend of late is forgotten over 60 s of a neck's time, 300 time constants.
 _FORGET_RATE = 1.0 / 60.0
 # A stalled drive gives way as the bend does: 4 ms at 20 ms follow that closely enough.
@@ -135,6 +138,8 @@ def neck_advance(
     # The largest slope that these add, as a part of the stiffness.
     skew = abs(coupling) + 4.0 * (abs(lobe0) + abs(lobe1))
     most = dt * body[BODY_TOP_SPEED]
+    drag = body[BODY_DRAG] * neck[NECK_PULL_LIMIT]
+    part = 1.0 - math.exp(-body[BODY_DRAG_RATE] * dt)
     arc = body[BODY_ARC]
     arm = 2.0 * arc / neck[NECK_LEVER]
     size = math.sqrt(x.b[0] * x.b[0] + x.b[1] * x.b[1])
@@ -150,6 +155,7 @@ def neck_advance(
             # x_j = pull_limit, solved for m_j. Where the neck moves away a stalled drive gives way: below m.
             limit = neck[NECK_PULL_LIMIT] - neck[NECK_PRETENSION] + neck[NECK_LEVER] * toward + nearer
             lagging = keep * m[j] + (1.0 - keep) * targets[j]
+            limit = min(max(m[j] + part * (limit - m[j]), limit - drag), limit + drag)
             m[j] = min(min(max(lagging, m[j] - most), m[j] + most), limit)
             stretch = neck[NECK_PRETENSION] + m[j] - neck[NECK_LEVER] * toward - nearer
             if stretch > 0.0:  # a slack tendon neither pulls nor adds to `rate`
@@ -286,7 +292,7 @@ class GreyBoxArrays(NarxArrays):
     """The parameters of the equations and the arrays around them."""
 
     neck = array("numbers", "of the equations, in the order of NECK_*; of another robot its tendons behind them")
-    body = array("15", "reach [rad], softening, creep, anisotropy, stop, arc, home, top speed; see BODY_*")
+    body = array("17", "reach [rad], softening, creep, anisotropy, stop, arc, home, drives; see BODY_*")
     sensor = array("2", "dead time [samples], and sample time in the time of a neck [s]")
     echo = array("outputs, p", "of what was measured above the equations, newest first")
     memory = array("1", "samples after which a held start has settled")

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..models._arrays import RIGID
+
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
@@ -77,8 +79,6 @@ def payload_parameters(payloads: int) -> tuple[Parameter, ...]:
     return PAYLOAD_PARAMETERS if payloads == _STRAIGHT_PAYLOADS else (*PAYLOAD_PARAMETERS, PAYLOAD_CURVE)
 
 
-# A speed that no drive reaches [rad/s].
-FASTEST = 1e4
 # What a body of foam or coils does beside, each part on its own; zero is a body of constant stiffness without creep.
 SOFTENING_PARAMETERS = (
     Parameter("softening", "1", 0.05, 0.0, 20.0, 3.0, False, "stiffness at rest over that at the reach, less one"),
@@ -116,7 +116,11 @@ STOP_PARAMETERS = (
 ARC_PARAMETERS = (
     Parameter("arc", "rad/rad^2", 0.5, 0.0, 20.0, 1.0, False, "what the square of a bend takes off each tendon's way"),
 )
-SPEED_PARAMETERS = (Parameter("top_speed", "rad/s", 20.0, 0.5, FASTEST, 1.0, True, "largest speed of the drives"),)
+SPEED_PARAMETERS = (
+    Parameter("top_speed", "rad/s", 20.0, 0.5, float(RIGID[14]), 1.0, True, "largest speed of the drives"),
+    Parameter("drag", "1", 0.05, 0.0, 0.9, 0.1, False, "friction of a moving drive over its pull limit"),
+    Parameter("drag_rate", "1/s", 3.0, 0.01, 80.0, 1.0, True, "how soon it falls as a drive comes to rest"),
+)
 PARTS = {
     "anisotropy": ANISOTROPY_PARAMETERS,
     "stop": STOP_PARAMETERS,
@@ -132,8 +136,6 @@ BODY_PARAMETERS = (
     *SOFTENING_PARAMETERS, *CREEP_PARAMETERS[:2], *ANISOTROPY_PARAMETERS, *STOP_PARAMETERS, *ARC_PARAMETERS,
     *HOME_PARAMETERS, *CREEP_PARAMETERS[2:], *SPEED_PARAMETERS,
 )  # fmt: skip
-# A body of constant stiffness without creep, behind drives of any speed.
-RIGID = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, FASTEST])
 
 # Those that have no meaning where the link bends in one plane.
 OUT_OF_PLANE_PARAMETERS = ("asymmetry", "rest_roll", "twist")

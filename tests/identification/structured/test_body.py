@@ -155,6 +155,27 @@ def test_drives_turn_at_their_top_speed_until_they_are_near() -> None:
     np.testing.assert_array_equal(run(body(top_speed=1e3), held(0.55, 60))[0], run(RIGID, held(0.55, 60))[0])
 
 
+def test_friction_holds_a_stalled_drive_back_and_falls_as_it_comes_to_rest() -> None:
+    numbers = GUESS.copy()
+    numbers[[index("gain"), index("compliance")]] = 0.0  # the link stays as it is
+    limit, pretension = numbers[index("pull_limit")], numbers[index("pretension")]
+    M = run(body(drag=0.2, drag_rate=3.0), held(2.0, 100), numbers)[0][:, 0]
+    short = limit - pretension - M
+    stalled = short <= 0.2 * limit
+    assert short[stalled][0] == pytest.approx(0.2 * limit, rel=0.06)  # within a sample's yielding
+    # Powers of substeps round.
+    np.testing.assert_allclose(short[stalled][1:] / short[stalled][:-1], np.exp(-3.0 * TS), rtol=1e-9)
+    assert stalled.sum() > 50
+    np.testing.assert_array_equal(run(body(drag_rate=3.0), held(2.0, 60))[0], run(RIGID, held(2.0, 60))[0])
+
+
+@pytest.mark.parametrize(("top_speed", "found"), [(2.0, "speed"), (100.0, "rigid")])
+def test_the_speed_of_drives_is_kept_where_logged_motors_show_it(top_speed: float, found: str) -> None:
+    data = recording(body(top_speed=top_speed), "mixed", 1, 300)
+    model = GreyBox(sensor_delay=2, evaluations=8).fit(data)
+    assert model.settings["body"] == found
+
+
 def test_a_neck_at_home_where_it_rests_moves_as_one_that_rests_straight() -> None:
     numbers = GUESS.copy()
     # A cube of the bend and friction know where it is straight, or where it was.
@@ -192,7 +213,7 @@ def test_the_search_for_the_top_speed_begins_at_the_recorded_one() -> None:
     channels = dict(zip((*SET_POINTS, *MOTOR_POSITIONS, "pitch", "roll"), (*U.T, *M.T, *Y.T), strict=True))
     data = Recording(np.arange(len(U)) * TS, TS, channels)
     problem = FitProblem.of(ScaledData.of(data, amplitudes=False))
-    (speed,) = PARTS["speed"]
+    speed, *_ = PARTS["speed"]
     # The drives get that fast; sums of substeps round.
     assert problem.guess(speed) == pytest.approx(2.0, rel=1e-9)
     # Set-points that the drives keep up with do not tell it.
