@@ -31,18 +31,16 @@ _ROWS = 2000
 def compile_ahead(*recordings: str) -> None:
     """Compile what the steps after the models call, in a process that no step waits for.
 
-    Run are the loops of the first controllers and an observer over a family of few rows, then the loops over the best
-    model if that is nonlinear, and the predictions of the report; the steps then load the functions from the cache.
+    Run are the loops of the first controllers over a family of few rows, then those over the best model if that is
+    nonlinear, and the predictions of the report; the steps then load the functions from the cache.
     """
-    from softneck import estimation, signals
+    from softneck import signals
 
     gc.set_threshold(*GARBAGE_THRESHOLDS)
     first = signals.read_recording(recordings[0])
     family = _family_of(first.rows(0, _ROWS))
     if family.draws is not None:
         _judge_kinds(family, family.draws.model)
-    observer = estimation.KalmanSettings().design(family)
-    estimation.consistency(estimation.fit_observer(observer, [first], set()).observer, first)
     _await(PI)  # the models are there then
     if family.draws is not None and linear_model() != AUTO:
         _judge_kinds(family, load(AUTO))

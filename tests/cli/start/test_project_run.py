@@ -197,13 +197,10 @@ def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model_i
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nonlinear: bool, few: str
 ) -> None:
     """The family is of few rows, before that of `start` is there; where they tell too little it waits for that one."""
-    tuning, estimation = SimpleNamespace(LEVELS=("linear", "margins")), SimpleNamespace()
+    tuning = SimpleNamespace(LEVELS=("linear", "margins"))
     ran: list[tuple[Any, ...]] = []
     tuning.task_of = lambda plants, *_: plants
     tuning.judge_candidate = lambda task, kind, _, level: ran.append((*task[1:], kind, level, Path(_plan.PI).exists()))
-    estimation.KalmanSettings = lambda: SimpleNamespace(design=lambda family: ran.append((family.draws.model,)))
-    estimation.fit_observer = lambda *_: SimpleNamespace(observer=None)
-    estimation.consistency = lambda *_: None
     asked: list[float] = []
 
     def comes(_: float) -> None:
@@ -221,7 +218,6 @@ def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model_i
     Path("models").mkdir()
     Path("models", f"auto_{'linear' if nonlinear else 'nonlinear'}.npz").touch()  # the best of the other sort
     monkeypatch.setattr(softneck, "tuning", tuning)
-    monkeypatch.setattr(softneck, "estimation", estimation)
     monkeypatch.setattr(softneck, "family", family_of)
     monkeypatch.setattr(_compile_ahead.time, "sleep", comes)
     monkeypatch.setattr(_compile_ahead, "cache_folder", lambda: tmp_path)
@@ -237,7 +233,7 @@ def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model_i
 
     # Last what the report predicts with: the best model and the best linear one.
     report = [("log.csv", "models/auto.npz"), *([("log.csv", "models/auto_linear.npz")] if nonlinear else [])]
-    assert ran == [*judged("drawn", False), ("drawn",), *(judged(auto, True) if nonlinear else []), *report]
+    assert ran == [*judged("drawn", False), *(judged(auto, True) if nonlinear else []), *report]
     assert len(asked) == (1 if few == "explain" else 2)
     assert _compile_ahead.compiled_before().is_file()
 
