@@ -99,7 +99,7 @@ class Candidate:
 
         It is the largest ratio where all hold, else 1 plus the sum of x/(1 + x/4) over the excesses x beyond 1: an
         exact penalty (Nocedal and Wright 2006, sec. 17.2). With `aim` it is the ratio of that metric where all hold,
-        and among equal ones the modulus margin 1/Ms decides.
+        and the mean ratio, which breaks ties, has the lacking modulus margin 1 - 1/Ms as one more.
         """
         each = self.ratios(bounds, tested=tested)
         found = list(each.values())
@@ -111,7 +111,8 @@ class Candidate:
             return 1.0 + beyond + rest
         if aim in each:
             sensitivity = self.metrics.get("axes.sensitivity", math.inf)
-            rest = _TIE_WEIGHT * (1.0 - (1.0 / sensitivity if sensitivity > 0.0 else 0.0))
+            near = 1.0 / sensitivity if sensitivity > 0.0 else 0.0
+            rest = (len(found) * rest + _TIE_WEIGHT * (1.0 - near)) / (len(found) + 1)
         return (1.0 - _TIE_WEIGHT) * each.get(aim, max(found)) + rest
 
     def holds(self, bounds: Sequence[Requirement], *, tested: bool) -> bool:
@@ -201,10 +202,10 @@ class Search:
             for steps in steps_on_all_draws(self.task, item.kind, item.settings).values():
                 item.update(item.level, Judgement({metric: worst(metric, each) for metric, each in steps.items()}))
         best = math.inf
-        for item in sorted(items, key=self.cost):
-            if self.cost(item) < best:
+        for item in sorted(items, key=self._final_cost):
+            if self._final_cost(item) < best:
                 self._judge([item], "margins", 0)
-                best = min(best, self.cost(item))
+                best = min(best, self._final_cost(item))
 
     def sort_candidates(self) -> list[Candidate]:
         """Return all candidates with metrics, the best first."""
@@ -212,7 +213,13 @@ class Search:
 
     def cost(self, item: Candidate) -> float:
         """Return the cost of a candidate."""
-        return item.cost(self.task.aims, tested=self.task.tested, aim="sim.rise_s" if self.task.drawn else "")
+        return self._final_cost(item) if item.level == LEVELS[-1] else self._cost(item, self.task.aims)
+
+    def _final_cost(self, item: Candidate) -> float:
+        return self._cost(item, self.task.final_aims)
+
+    def _cost(self, item: Candidate, aims: Sequence[Requirement]) -> float:
+        return item.cost(aims, tested=self.task.tested, aim="sim.rise_s" if self.task.drawn else "")
 
     def _candidates_of(self, kind: str) -> list[Candidate]:
         return [item for item in self.candidates.values() if item.kind == kind]

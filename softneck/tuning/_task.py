@@ -88,7 +88,15 @@ class Task:
     @property
     def aims(self) -> tuple[Requirement, ...]:
         """Requirements of the search: closer by what it keeps for draws that it does not see."""
-        return tuple(_closer(item, self.asked.kept.get(item.metric, 0.0)) for item in self.bounds)
+        return self._closer(1.0)
+
+    @property
+    def final_aims(self) -> tuple[Requirement, ...]:
+        """Requirements of final candidates, which are judged on as many draws as a certificate: half as much closer."""
+        return self._closer(0.5)
+
+    def _closer(self, part: float) -> tuple[Requirement, ...]:
+        return tuple(_closer(item, part * self.asked.kept.get(item.metric, 0.0)) for item in self.bounds)
 
     @property
     def said_cocontraction(self) -> float | None:

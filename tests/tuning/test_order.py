@@ -860,7 +860,7 @@ def searching(kinds: str = "abcdefg", budget: int = 20, **more: Any) -> Search:
     bounds = (Requirement("m", "max", 1.0, True),)
     asked = SimpleNamespace(bounds=bounds, stated=frozenset())
     task: Any = SimpleNamespace(
-        bounds=bounds, aims=bounds, tested=False, seed=0, **{"drawn": (), "asked": asked, **more}
+        bounds=bounds, aims=bounds, final_aims=bounds, tested=False, seed=0, **{"drawn": (), "asked": asked, **more}
     )
     return Search(task, spaces, None, None, budget, lambda *_: None)  # pyright: ignore[reportArgumentType]
 
@@ -1120,6 +1120,9 @@ def test_a_search_is_led_by_what_it_aims_at_and_its_finals_are_of_each_kind(monk
     search.task.aims = closer  # pyright: ignore[reportAttributeAccessIssue]
     item = of_kind("a", 0.75)
     assert search.cost(item) == item.cost(closer, tested=False) > 1.0 > item.cost(search.task.bounds, tested=False)
+    # One that is judged on all draws is compared by what is kept then.
+    item.level = LEVELS[-1]
+    assert search.cost(item) == item.cost(search.task.final_aims, tested=False) < 1.0
     # Four of the better kind, and one of another that is left out of none.
     for number, (kind, value) in enumerate([("a", 0.1), ("a", 0.2), ("a", 0.3), ("b", 0.4)]):
         search.candidates[kind, str(number)] = of_kind(kind, value, number=number)
@@ -1137,7 +1140,7 @@ def test_a_search_is_led_by_what_it_aims_at_and_its_finals_are_of_each_kind(monk
 def test_finals_that_are_left_out_could_not_win(values: list[tuple[float, float, float]], drawn: bool) -> None:
     """The best is the same as if all were judged, and so is its value: more loops only add to a cost."""
     search, judged, name = searching("a", own={"p": 1}, drawn=("d",) * drawn), list[Candidate](), "sim.overshoot_pct"
-    search.task.aims = (Requirement(name, "max", 1.0, True),)  # pyright: ignore[reportAttributeAccessIssue]
+    search.task.final_aims = (Requirement(name, "max", 1.0, True),)  # pyright: ignore[reportAttributeAccessIssue]
     items = [Candidate("a", {}, np.zeros(1), "all", {name: before, "axes.sensitivity": 1.0}) for before, _, _ in values]
     of_steps = [before + steps * drawn for before, steps, _ in values]
     whole = [known + more for known, (_, _, more) in zip(of_steps, values, strict=True)]
@@ -1447,6 +1450,7 @@ def resumable(monkeypatch: pytest.MonkeyPatch, values: dict[str, float], *, foun
         tested: bool = False
         bounds: Any = LIMITS
         aims: Any = LIMITS
+        final_aims: Any = LIMITS
 
     search: Any = _Resumed(Plants(seed=not found), searching("ab").spaces, None, None, 40, lambda *_: None)  # pyright: ignore[reportArgumentType]
     best = Candidate("a", {}, np.zeros(1), "margins", {**values, "axes.sensitivity": 1.0, "m": 0.1})

@@ -82,7 +82,10 @@ def test_where_draws_decide_the_search_alone_stays_below_the_default_limit() -> 
     assert aims["sim.overshoot_pct"] == pytest.approx(known.limit("sim.overshoot_pct"))
     assert aims["axes.gain_margin"] == limits["axes.gain_margin"] + 0.2
     assert {name for name, limit in aims.items() if limit != limits[name]} == set(drawn.kept)
-    assert replace(task, asked=known).aims == replace(task, asked=known).bounds
+    assert replace(task, asked=known).aims == replace(task, asked=known).bounds == replace(task, asked=known).final_aims
+    # Final candidates have seen as many draws as a certificate has: half as much is kept.
+    final = {b.metric: b.limit for b in seen.final_aims}
+    assert final == pytest.approx({name: 0.5 * (limits[name] + aims[name]) for name in limits})
     # A reserve of one's own is taken off all limits, as without draws; a limit below it is aimed at itself.
     own = {"reserve": {"sim.overshoot_pct": 1.0}}
     assert make_tune_requirements(own, drawn=True).bounds == make_tune_requirements(own).bounds
