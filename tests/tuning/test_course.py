@@ -43,8 +43,8 @@ def judged(_: Any, kind: str, settings: Mapping[str, Any], level: str) -> Judgem
 def searched(monkeypatch: pytest.MonkeyPatch, budget: int, tested: bool = True, tell: Any = lambda *_: None) -> Search:
     monkeypatch.setattr(_search, "judge_candidate", judged)
     task: Any = SimpleNamespace(
-        asked=SimpleNamespace(bounds=BOUNDS), bounds=BOUNDS, aims=BOUNDS, final_aims=BOUNDS, own={"neck": 0}, seed=0, tested=tested,
-        drawn=(),
+        asked=SimpleNamespace(bounds=BOUNDS), bounds=BOUNDS, aims=BOUNDS, final_aims=BOUNDS, own={"neck": 0}, seed=0,
+        tested=tested, drawn=(),
     )  # fmt: skip
     each = spaces(("pi", "hinf"), rise=0.4, cocontraction=None, robot=Robot.preset())
     found = Search(task, each, None, Log(None, ""), budget, tell)
