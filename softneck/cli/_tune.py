@@ -29,7 +29,7 @@ _DEFAULT_BUDGET = 160
 )  # fmt: skip
 @click.option("--observer", type=_PATH, help="Of the loop. [default: a Kalman filter over the nominal plant]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the search and its noise.")
-@click.option("--workers", type=click.IntRange(min=0), help="More processes. [default: one for each further core]")
+@click.option("--workers", type=click.IntRange(min=0), help="More processes. [default: one a further core, at most 7]")
 @click.option("-o", "--output", type=_PATH, metavar="DIR", required=True, help="Folder of the search and its results.")
 @common_options("robot", "force")
 def command(

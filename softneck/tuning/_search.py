@@ -98,8 +98,8 @@ class Candidate:
         """Return the cost, at most 1 where all known requirements hold.
 
         It is the largest ratio where all hold, else 1 plus the sum of x/(1 + x/4) over the excesses x beyond 1: an
-        exact penalty (Nocedal and Wright 2006, sec. 17.2). With `aim` it is the ratio of that metric where all hold,
-        and the mean ratio, which breaks ties, has the lacking modulus margin 1 - 1/Ms as one more.
+        exact penalty (Nocedal and Wright 2006, sec. 17.2). With `aim` it is the ratio of that metric where all hold.
+        The mean ratio breaks ties; with `aim`, 1 - 1/Ms counts as one more ratio.
         """
         each = self.ratios(bounds, tested=tested)
         found = list(each.values())
@@ -143,7 +143,7 @@ class Search:
     `task`: what is tuned. `spaces`: of the kinds. `workers`: processes beside this one. `log`: of judgements.
     `budget`: of judgements. `report`: called with progress and the best so far. `finals`: number of final candidates
     with margins by experiment. `earlier`: number of judgements of the search that this one resumes. `started`: done
-    when the workers have imported what they need.
+    when a worker has imported and compiled what it needs.
     """
 
     task: Task
@@ -363,7 +363,7 @@ class Search:
         self._report_progress()
 
     def _start_workers(self, item: Candidate, level: str) -> Future | None:
-        """Have the workers import, and compile or load, what the kind needs that has its turn last here."""
+        """Have a worker start with the kind that this process judges last; its result is not used."""
         if self.workers is None:
             return None
         return self.workers.pool.submit(judge_candidate, self.task, item.kind, item.settings, level)

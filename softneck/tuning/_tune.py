@@ -56,6 +56,8 @@ from ._search import Candidate, Search
 from ._space import KINDS_SEARCHED, UNCERTIFIED, spaces
 from ._task import Log, Task, digest_of
 
+# More hardly have work, as a generation has six candidates of a kind, and each takes 250 MB.
+_MOST_WORKERS = 7
 #: Default number of judgements of candidates.
 BUDGET = 160
 # Draws of a family in every loop of a search; final candidates are judged on more, and certificates have others.
@@ -140,7 +142,7 @@ def tune(
         budget: number of judgements of candidates; 40 % more where draws of a family fail.
         observer: of the loop; default a Kalman filter over the nominal plant.
         seed: of the search and of the noise in its loops.
-        workers: processes beside this one; default one for each further core.
+        workers: processes beside this one; default one for each further core, at most 7.
         folder: of the log; the same call continues its search.
         force: replace another search in `folder`.
         files: role -> (path, SHA-256) of the files read, for the certificate.
@@ -179,7 +181,7 @@ def tune(
     prepare(task)  # report a plant that does not fit before the search
     log = Log(folder, task.digest, force=force)
     with shown_progress("tune", progress) as tell:
-        beside = core_count() - 1 if workers is None else workers
+        beside = min(core_count() - 1, _MOST_WORKERS) if workers is None else workers
         with open_workers(beside, None) if beside else contextlib.nullcontext() as pool:
             search = Search(task, each, pool, log, budget, lambda done, text: tell(0.9 * done, text))
             search.dropped |= dropped

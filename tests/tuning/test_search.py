@@ -21,7 +21,7 @@ from softneck.core import KINDS, FileFormatError, OutputFileError, SettingsError
 from softneck.core._kinds import make_settings
 from softneck.plant import NeckParameters
 from softneck.robot import Robot, Scaling
-from softneck.tuning import _search, task_of, tune
+from softneck.tuning import _search, _tune, task_of, tune
 from softneck.tuning._compare import active_requirement, front
 from softneck.tuning._judge import cases, judged_delay, told_conditions
 from softneck.tuning._requirements import make_tune_requirements
@@ -241,6 +241,31 @@ def test_work_is_given_out_two_to_a_worker_and_all_of_it_comes_back(monkeypatch:
     # A single one is not given away: this process would wait for it.
     run_jobs(jobs[:1], lambda job: lambda: job.settings, took, lambda: workers)  # pyright: ignore[reportArgumentType, reportReturnType]
     assert (here[-1], taken[-1]) == ("0", 0)
+
+
+@pytest.mark.parametrize(
+    ("cores", "asked", "beside"), [(1, None, 0), (2, None, 1), (64, None, 7), (2, 5, 5), (8, 0, 0)]
+)
+def test_by_default_each_further_core_has_a_process_but_no_machine_has_more_than_seven(
+    monkeypatch: pytest.MonkeyPatch, cores: int, asked: int | None, beside: int
+) -> None:
+    opened: list[int] = []
+
+    def open_workers(number: int, dask: None) -> Any:
+        assert dask is None
+        opened.append(number)
+        return contextlib.nullcontext()
+
+    def run(search: Any) -> None:
+        assert search.workers is None
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_tune, "core_count", lambda: cores)
+    monkeypatch.setattr(_tune, "open_workers", open_workers)
+    monkeypatch.setattr(_search.Search, "run", run)
+    with pytest.raises(KeyboardInterrupt):
+        searched(workers=asked)
+    assert opened == [beside] * bool(beside)
 
 
 def test_a_worker_that_dies_ends_a_search_with_what_to_do() -> None:
