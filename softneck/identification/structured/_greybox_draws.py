@@ -12,7 +12,7 @@ from softneck.signals import Recording
 from ..models._fitting import ScaledData, training_recording
 from ..models._model import Model
 from ._greybox import GreyBox
-from ._output_error import DECIMATION, FitProblem, SearchProgress, correlation_time
+from ._output_error import DECIMATION, FitProblem, SearchProgress, correlation_time, slopes
 from ._parameters import PARTS
 
 # Length of a segment [s of a neck's time]: ten of its time constants.
@@ -20,8 +20,6 @@ _SEGMENT_S = 2.0
 # A draw whose squared error on the recordings is more than this multiple of the least does not explain them.
 # With 3 held-out motions score better by 4 % on one of four test necks, and single draws beyond 2 decided certificates.
 _MOST_COST = 2.0
-# Step of the derivatives: far above rounding, far below the curvature of a number.
-_STEP = 1e-4
 # Steps of Gauss-Newton at a neighbouring dead time, from the numbers of the best one.
 _EVALUATIONS = 6
 # Quantile 0.95 of chi-squared with one degree of freedom.
@@ -67,10 +65,7 @@ class GreyBoxDraws:
         problem = FitProblem.of(scaled).with_parts(*kept)
         x = np.array([n.encode(table[n.name] * (second if n.is_rate else 1.0)) for n in problem.numbers])
         delay, count = int(model.findings["sensor_delay"]), x.size
-        e = problem.errors(x, delay)[count:]
-        steps = _STEP * np.eye(count)
-        pairs = [(problem.errors(x + d, delay)[count:], problem.errors(x - d, delay)[count:]) for d in steps]
-        J = np.array([above - below for above, below in pairs]).T / (2.0 * _STEP)
+        e, J = problem.errors(x, delay)[count:], slopes(problem, x, delay)[:, count:]
         variance = float(e @ e) / e.size * correlation_time(problem.misses(x, delay))
         least, centres = float(e @ e), {delay: (x, 0.0)}
         for other in (delay - 1, delay + 1):
@@ -82,10 +77,10 @@ class GreyBoxDraws:
                 centres[other] = (found, float(cost @ cost) - least)
         groups = _segments(problem, e.size)
         G = np.zeros((groups.max() + 1, count))
-        np.add.at(G, groups, J * e[:, None])
+        np.add.at(G, groups, J.T * e[:, None])
         prior = np.diag(np.array([n.spread for n in problem.numbers]) ** -2.0)
         return cls(
-            model=model, problem=problem, centres=centres, hessian=J.T @ J, push=G.T @ G, prior=prior,
+            model=model, problem=problem, centres=centres, hessian=J @ J.T, push=G.T @ G, prior=prior,
             variance=variance, least=least,
         )  # fmt: skip
 
@@ -134,8 +129,8 @@ def _segments(problem: FitProblem, size: int) -> np.ndarray:
     """Return the segment (size,) of every error that the fit minimises."""
     length = max(1, round(_SEGMENT_S / problem.sample_time / DECIMATION))
     parts, first = [], 0
-    for (_, _, motors, outputs), rows in zip(problem.runs, problem.rows, strict=True):
-        number = first + np.arange(len(rows)) // length
+    for _, _, motors, outputs in problem.runs:
+        number = first + np.arange(len(outputs[problem.rows])) // length
         parts.append(np.repeat(number, outputs.shape[1]))
         if problem.logged:
             parts.append(np.repeat(number, motors.shape[1]))

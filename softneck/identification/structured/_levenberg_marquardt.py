@@ -54,7 +54,7 @@ def minimise(errors: Callable[[Vector], Vector], start: Vector, bounds: Bounds, 
     curved, damping, stalled = False, _FIRST, 0
     for _ in range(steps):
         J = _jacobian(errors, at, bounds)
-        g, H = J.T @ at.e, J.T @ J
+        g, H = J @ at.e, J @ J.T
         found = _step(errors, at, g, H, bounds, curved, damping)
         if found is None and not stalled:
             curved, stalled = not curved, 1
@@ -72,17 +72,18 @@ def minimise(errors: Callable[[Vector], Vector], start: Vector, bounds: Bounds, 
 
 
 def _jacobian(errors: Callable[[Vector], Vector], at: _Point, bounds: Bounds) -> Matrix:
-    """Return the slopes (errors, n) by differences that stay within the bounds."""
-    J = np.empty((at.e.size, at.x.size))
+    """Return the slopes (n, errors) by differences that stay within the bounds."""
+    J = np.empty((at.x.size, at.e.size))
     steps = _DIFFERENCE * bounds.scale
     steps = np.where(at.x + steps <= bounds.high, steps, -steps)
 
-    def column(i: int) -> None:
+    def slope(i: int) -> None:
         moved = at.x.copy()
         moved[i] += steps[i]
-        J[:, i] = (errors(moved) - at.e) / steps[i]
+        np.subtract(errors(moved), at.e, out=J[i])
+        J[i] /= steps[i]
 
-    side_by_side([partial(column, i) for i in range(at.x.size)])
+    side_by_side([partial(slope, i) for i in range(at.x.size)])
     return J
 
 

@@ -79,7 +79,7 @@ BODY_DRAG_RATE = 16
 # The largest bend of late is forgotten over 60 s of a neck's time, 300 time constants.
 _FORGET_RATE = 1.0 / 60.0
 # A stalled drive gives way as the bend does: 4 ms at 20 ms follow that closely enough.
-_SUBSTEPS = 5
+NECK_SUBSTEPS = 5
 _LARGEST_BEND = 1.2
 
 
@@ -115,15 +115,16 @@ def neck_advance(
     body: np.ndarray,
     e: np.ndarray,
     sample_time: float,
+    substeps: int,
     targets: np.ndarray,
     m: np.ndarray,
     x: NeckState,
 ) -> None:
-    """Move the motors `m` (motors,) towards `targets`, and the body in `x`, by one sample.
+    """Move the motors `m` (motors,) towards `targets`, and the body in `x`, by one sample in so many substeps.
 
     `e` (2, motors) is filled by `neck_directions`.
     """
-    dt = sample_time / _SUBSTEPS
+    dt = sample_time / substeps
     keep = math.exp(-neck[NECK_DRIVE_RATE] * dt)  # exact for a target that is held
     share = 0.5 if neck.shape[0] == NECK_SIZE else neck[NECK_SHARE]
     # Of a body that was not bent of late, at half of its reach.
@@ -143,7 +144,7 @@ def neck_advance(
     arc = body[BODY_ARC]
     arm = 2.0 * arc / neck[NECK_LEVER]
     size = math.sqrt(x.b[0] * x.b[0] + x.b[1] * x.b[1])
-    for _ in range(_SUBSTEPS):
+    for _ in range(substeps):
         pull0 = 0.0
         pull1 = 0.0
         total = 0.0
@@ -249,6 +250,7 @@ def neck_run(
     neck: np.ndarray,
     body: np.ndarray,
     sample_time: float,
+    substeps: int,
     delay: np.ndarray,
     lines: int,
     settle: int,
@@ -269,7 +271,7 @@ def neck_run(
     axes = outputs.shape[1]
     # Under set-points that stay: a run begins at rest, as its recording is taken to.
     for _ in range(settle):
-        neck_advance(neck, body, e, sample_time, start, m, x)  # pyright: ignore[reportArgumentType]
+        neck_advance(neck, body, e, sample_time, substeps, start, m, x)  # pyright: ignore[reportArgumentType]
         neck_crept(x)  # pyright: ignore[reportArgumentType]
         neck_sense(neck, sample_time, x)  # pyright: ignore[reportArgumentType]
     motors[0] = m
@@ -278,7 +280,7 @@ def neck_run(
         for j in range(m.shape[0]):
             back = k + 1 - int(delay[j])
             held[j] = targets[back, j] if back >= 0 else start[j]
-        neck_advance(neck, body, e, sample_time, held, m, x)  # pyright: ignore[reportArgumentType]
+        neck_advance(neck, body, e, sample_time, substeps, held, m, x)  # pyright: ignore[reportArgumentType]
         neck_sense(neck, sample_time, x)  # pyright: ignore[reportArgumentType]
         motors[k + 1] = m
         outputs[k + 1] = x[5 : 5 + axes]
@@ -316,7 +318,7 @@ def greybox_rest(
     e = np.empty((2, p.motors))
     neck_directions(neck, e)
     for _ in range(int(p.memory[0])):
-        neck_advance(neck, p.body, e, p.sensor[1], np.zeros(p.motors), m, x.neck)
+        neck_advance(neck, p.body, e, p.sensor[1], NECK_SUBSTEPS, np.zeros(p.motors), m, x.neck)
         neck_crept(x.neck)
         # The sensor settles with the neck: its dead time holds the tilt at rest.
         neck_sense(neck, p.sensor[1], x.neck)
@@ -346,7 +348,7 @@ def greybox_step(
         targets[j] = x.u[int(p.drive[j, 1]) - 1, j]  # u(k+1-d); d >= 1 for this kind
     e = np.empty((2, p.motors))
     neck_directions(neck, e)
-    neck_advance(neck, p.body, e, p.sensor[1], targets, m, x.neck)
+    neck_advance(neck, p.body, e, p.sensor[1], NECK_SUBSTEPS, targets, m, x.neck)
     neck_sense(neck, p.sensor[1], x.neck)
     ahead = np.empty(p.outputs)
     for axis in range(p.outputs):

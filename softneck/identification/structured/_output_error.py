@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from softneck.core import Matrix, Progress, Vector, compute_once
+from softneck.core import Matrix, Progress, Vector, compute_once, side_by_side
 from softneck.robot import Robot
 from softneck.runtime import load_functions
 
@@ -15,6 +16,7 @@ from ..models._drive import drive_start
 from ..models._fitting import ScaledData, payload_of
 from ._levenberg_marquardt import Bounds, minimise
 from ._loaded_greybox_runtime import loaded_neck
+from ._neck_equations_runtime import NECK_SUBSTEPS
 from ._parameters import (
     BODY_PARAMETERS,
     OUT_OF_PLANE_PARAMETERS,
@@ -40,8 +42,12 @@ _SENSOR_DELAYS = (2, 1, 3, 4)
 _NECK_SAMPLE = 0.02
 _TYPICAL_DRIVE_DELAY = 0.08
 DECIMATION = 2
+# Substeps of searches that another one refines: half the time, and on five necks and two motions fits as good.
+_COARSE_SUBSTEPS = 2
 # Steps of a search that starts at what a like one found.
 _SHORT = 8
+# Of central differences: far above rounding, far below the curvature of a number.
+_STEP = 1e-4
 # How much the sensor's dead time usually changes [samples].
 _DELAY_SPREAD = 1.0
 
@@ -50,15 +56,14 @@ _DELAY_SPREAD = 1.0
 class FitProblem:
     """All runs as arrays; the drives' dead times are known beforehand.
 
-    runs: set-points, start, motor positions and outputs of each; rows: those of each run that count; payloads: [kg];
+    runs: set-points, start, motor positions and outputs of each; payloads: [kg];
     drive_delays: (motors,) in samples; logged: whether motor positions were; numbers: searched; tendons: nothing of
     three tendons 120 deg apart; reach: largest tilt [rad]; prior: what a number a spread away from its guess counts, as
-    an error [rad] of one row.
+    an error [rad] of one row; substeps: of the equations in a sample.
     """
 
     sample_time: float
     runs: list[tuple[Matrix, Vector, Matrix, Matrix]]
-    rows: list[np.ndarray]
     payloads: list[float]
     payload_range: tuple[float, float]
     drive_delays: Vector
@@ -67,6 +72,7 @@ class FitProblem:
     tendons: Vector
     reach: float
     prior: float = _PRIOR_WEIGHT_RAD
+    substeps: int = NECK_SUBSTEPS
 
     @classmethod
     def of(cls, scaled: ScaledData, drive_delays: Vector | None = None) -> FitProblem:
@@ -83,11 +89,9 @@ class FitProblem:
         loads = payload_parameters(len(set(payloads)))
         numbers = (*(number for number in PARAMETERS if number.name not in across), *loads)
         reach = float(np.nanmax(np.linalg.norm(recording.outputs, axis=1)))
-        rows = [np.arange(round(SETTLING_S / Ts), len(run[0]), DECIMATION) for run in runs]
         return cls(
             sample_time=Ts,
             runs=runs,
-            rows=rows,
             payloads=payloads,
             payload_range=(min(payloads), max(payloads)),
             drive_delays=delays,
@@ -96,6 +100,11 @@ class FitProblem:
             tendons=_tendons(recording.robot),
             reach=max(reach, 1e-3),
         )
+
+    @property
+    def rows(self) -> slice:
+        """The rows of each run that count."""
+        return slice(round(SETTLING_S / self.sample_time), None, DECIMATION)
 
     @property
     def has_neck_tendons(self) -> bool:
@@ -172,6 +181,7 @@ class FitProblem:
                 loaded_neck(numbers, load, payload) if load.size else numbers,
                 body,
                 self.sample_time,
+                self.substeps,
                 self.drive_delays,
                 0,
                 settle,
@@ -185,31 +195,36 @@ class FitProblem:
 
     def misses(self, x: Vector, delay: float) -> list[Matrix]:
         """Return the errors (rows that count, outputs) of the tilts in each run."""
-        simulated = self.simulate(x, delay)
-        return [(Y - y)[rows] for (_, Y), (_, _, _, y), rows in zip(simulated, self.runs, self.rows, strict=True)]
+        rows, simulated = self.rows, self.simulate(x, delay)
+        return [Y[rows] - y[rows] for (_, Y), (_, _, _, y) in zip(simulated, self.runs, strict=True)]
 
     def errors(self, x: Vector, delay: float) -> Vector:
         """Return the errors that are minimised: of tilts, of motors, and of the numbers against their guesses."""
         guess = np.array([number.encode(number.guess) for number in self.numbers])
         spread = np.array([number.spread for number in self.numbers])
-        parts = [self.prior * (x - guess) / spread]
-        for (M, Y), (_, _, m, y), rows in zip(self.simulate(x, delay), self.runs, self.rows, strict=True):
-            parts.append((Y - y)[rows].ravel())
+        rows, parts = self.rows, [self.prior * (x - guess) / spread]
+        for (M, Y), (_, _, m, y) in zip(self.simulate(x, delay), self.runs, strict=True):
+            parts.append((Y[rows] - y[rows]).ravel())
             if self.logged:
-                parts.append(_MOTOR_WEIGHT * (M - m)[rows].ravel())
-        return np.nan_to_num(np.concatenate(parts))
+                parts.append(_MOTOR_WEIGHT * (M[rows] - m[rows]).ravel())
+        found = np.concatenate(parts)
+        return found if np.isfinite(found).all() else np.nan_to_num(found, copy=False)
 
     def delayed(self, delay: int | None, evaluations: int, tell: SearchProgress) -> Found:
         """Return the best fit; the sensor's dead time only shifts the output, and is searched as one number."""
         # Of a robot it is asked for without optional parts and with them.
         return compute_once(lambda: self._delayed(delay, evaluations, tell), self, delay, evaluations)
 
+    def coarse(self) -> FitProblem:
+        """Return the problem with longer substeps, to begin a search or to compare bodies."""
+        return replace(self, substeps=_COARSE_SUBSTEPS)
+
     def _delayed(self, delay: int | None, evaluations: int, tell: SearchProgress) -> Found:
         start = np.array([number.encode(number.guess) for number in self.numbers])
         if delay is not None:
             return self.search(start, delay, evaluations, tell)
         delays = self.delays()
-        found, late = self._search(start, float(delays[0]), evaluations, tell, (min(delays), max(delays)))
+        found, late = self.coarse()._search(start, float(delays[0]), evaluations, tell, (min(delays), max(delays)))
         nearest = dict.fromkeys((int(np.floor(late)), int(np.ceil(late))))
         return min((self.search(found, delay, _SHORT, tell) for delay in nearest), key=lambda each: each.cost)
 
@@ -295,17 +310,18 @@ class SearchProgress:
             self.progress(min(self.calls / self.expected, 0.99), f"{self.what}, loss {self.best[0]:.4g}")
 
 
+def slopes(problem: FitProblem, x: Vector, delay: float) -> Matrix:
+    """Return the derivatives (n, errors) of the errors by the search variables, by central differences."""
+    moves = _STEP * np.eye(x.size)
+    ends = side_by_side([partial(problem.errors, at, delay) for at in (*(x + moves), *(x - moves))])
+    return (np.array(ends[: x.size]) - np.array(ends[x.size :])) / (2.0 * _STEP)
+
+
 def intervals(problem: FitProblem, x: Vector, delay: int) -> list[dict]:
     """Return each number with unit, 95 % interval (linearised, the errors' colour taken into account) and range."""
-    J = np.empty((problem.errors(x, delay).size, x.size))
-    for i in range(x.size):
-        # A ten-thousandth of a number: far above rounding, far below its curvature.
-        step = np.zeros(x.size)
-        step[i] = 1e-4
-        J[:, i] = (problem.errors(x + step, delay) - problem.errors(x - step, delay)) / 2e-4
-    e = problem.errors(x, delay)
+    e, J = problem.errors(x, delay), slopes(problem, x, delay)
     covariance = (
-        np.linalg.pinv(J.T @ J) * float(e @ e) / max(e.size - x.size, 1) * correlation_time(problem.misses(x, delay))
+        np.linalg.pinv(J @ J.T) * float(e @ e) / max(e.size - x.size, 1) * correlation_time(problem.misses(x, delay))
     )
     half = 1.96 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     rows = []

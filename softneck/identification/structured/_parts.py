@@ -98,7 +98,7 @@ def choose_parts(
     largest and the fastest motions, and the phases of a run.
     """
     steps, left = min(evaluations, _STEPS), _able(found.problem)
-    limited = extend(found, (SPEED,), evaluations, tell) if found.problem.logged else found
+    limited = extend(found, (SPEED,), steps, tell) if found.problem.logged else found
     shows = limited.cost < _SPEED_SHOWS * found.cost
     if found.problem.logged and not shows:
         left.remove(SPEED)
@@ -125,7 +125,8 @@ def choose_parts(
         kept["+".join(best)] = least
         chosen += best
     if not chosen:
-        return limited if shows else found, {}
+        whole = limited.problem
+        return whole.search(limited.x, limited.delay, evaluations, tell) if shows else found, {}
     last = trials[0].found
     if shows and SPEED not in chosen:
         last, chosen = extend(last, (SPEED,), 1, tell), [*chosen, SPEED]
@@ -166,7 +167,7 @@ def _trial(found: Found, scaled: ScaledData, fold: Fold, evaluations: int, tell:
     def problem_of(recording: Recording) -> FitProblem:
         whole = found.problem
         own = FitProblem.of(replace(scaled, data=recording), whole.drive_delays)
-        return replace(own, numbers=whole.numbers, payload_range=whole.payload_range, reach=whole.reach)
+        return replace(own.coarse(), numbers=whole.numbers, payload_range=whole.payload_range, reach=whole.reach)
 
     problem = problem_of(fold.train)
     return _Trial(

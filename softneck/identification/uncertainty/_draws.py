@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import Any, Protocol
 
@@ -20,6 +21,7 @@ from softneck.core import (
     Vector,
     one_blas_thread,
     require_whole,
+    side_by_side,
     silent,
 )
 from softneck.signals import Recording, concatenate, conditions, merge_conditions
@@ -228,7 +230,7 @@ def make_draws(
         progress(0.7 + 0.15 * number / (len(sources) * len(_FACTORS)), f"draws: deviations times {factor:g}")
         rng = np.random.default_rng([seed, 0])
         trial = [source.draw(rng) for _ in range(_CALIBRATION_DRAWS)]
-        Y = replace(motions, model=source.model).simulate([source.arrays(draw, factor) for draw in trial])
+        Y = replace(motions, model=source.model).simulate(_arrays(source, factor, trial))
         loops = motions.disturbed(Y, *motions.disturbance(Y, memory), np.random.default_rng([seed, 2]))
         tried.append((motions.scores(loops), source, factor, Y))
     best, winner = min(((scores, source) for scores, source, _, _ in tried), key=lambda item: float(item[0].mean()))
@@ -237,11 +239,10 @@ def make_draws(
     _, source, factor, Y = next(item for item in tried if item[1] is winner and _no_worse(item[0], best))
     share, keep = motions.disturbance(Y, memory)
     more = next((more for more in _MORE if motions.covers(Y, more * share, keep)), _MORE[-1])
-    rows = []
-    rng = np.random.default_rng([seed, 1])
-    for number in range(SEARCH_DRAWS + ATTEMPTS * count):
-        progress(0.85 + 0.15 * number / (SEARCH_DRAWS + ATTEMPTS * count), "draws")
-        rows.append(source.arrays(source.draw(rng), factor))
+    rows, rng, sizes = list[dict[str, Matrix]](), np.random.default_rng([seed, 1]), [SEARCH_DRAWS, *[count] * ATTEMPTS]
+    for number, size in enumerate(sizes):
+        progress(0.85 + 0.15 * number / len(sizes), "draws")
+        rows += _arrays(source, factor, [source.draw(rng) for _ in range(size)])
     made = merge_conditions([conditions(part) for part in recordings])
     return Draws(
         model=source.model, arrays={name: np.array([row[name] for row in rows]) for name in rows[0]}, count=count,
@@ -249,6 +250,10 @@ def make_draws(
         coverage=motions.coverage(Y, more * share, keep),
         conditions={**made, "motion": _motion(whole)},
     )  # fmt: skip
+
+
+def _arrays(source: Source, factor: float, draws: Sequence[Vector]) -> list[dict[str, Matrix]]:
+    return side_by_side([partial(source.arrays, draw, factor) for draw in draws])
 
 
 def _no_worse(scores: Vector, best: Vector) -> bool:
@@ -336,12 +341,13 @@ class _Motions:
     def simulate(self, draws: Sequence[Mapping[str, Matrix]]) -> np.ndarray:
         """Return the simulations (draws, rows, outputs)."""
         outputs = self.outputs.shape[1]
-        found = []
-        for own in draws:
+
+        def simulate(own: Mapping[str, Matrix]) -> Matrix:
             model = replace(self.model, arrays={**self.model.arrays, **own})
             with np.errstate(all="ignore"):
-                found.append(np.asarray(model.simulate(self.recording))[:, :outputs])
-        return np.array(found)
+                return np.asarray(model.simulate(self.recording))[:, :outputs]
+
+        return np.array(side_by_side([partial(simulate, own) for own in draws]))
 
     def scores(self, Y: np.ndarray) -> Vector:
         """Return the continuous ranked probability score of the draws in each segment, relative to its motion.

@@ -13,6 +13,7 @@ from softneck.identification import GreyBox, Model
 from softneck.identification.models._fitting import ScaledData
 from softneck.identification.models._left_out import Fold, Judged
 from softneck.identification.structured._greybox import PARAMETERS
+from softneck.identification.structured._neck_equations_runtime import NECK_SUBSTEPS
 from softneck.identification.structured._output_error import FitProblem, Found, SearchProgress
 from softneck.identification.structured._parameters import BODY_PARAMETERS, PARTS, RIGID
 from softneck.identification.structured._parts import _Trial, _trial
@@ -38,7 +39,9 @@ CREEP = body(creep=0.8)
 
 def run(p: np.ndarray, U: np.ndarray, numbers: np.ndarray = GUESS) -> tuple[np.ndarray, np.ndarray]:
     M, Y = np.empty(U.shape), np.empty((len(U), 2))
-    FUNCTIONS.neck_run(numbers, p, TS, np.full(3, 3.0), 2, 50, np.ascontiguousarray(U), np.zeros(3), M, Y)
+    FUNCTIONS.neck_run(
+        numbers, p, TS, NECK_SUBSTEPS, np.full(3, 3.0), 2, 50, np.ascontiguousarray(U), np.zeros(3), M, Y
+    )
     return M, Y
 
 

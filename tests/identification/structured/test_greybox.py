@@ -15,7 +15,8 @@ from softneck.core import load, silent
 from softneck.identification import INFINITE, GreyBox, Model, validate
 from softneck.identification.models._fitting import ScaledData
 from softneck.identification.structured._greybox import INTERRUPTED, PARAMETERS
-from softneck.identification.structured._output_error import FitProblem, SearchProgress, intervals
+from softneck.identification.structured._neck_equations_runtime import NECK_SUBSTEPS
+from softneck.identification.structured._output_error import FitProblem, SearchProgress, intervals, slopes
 from softneck.identification.structured._parameters import RIGID
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
@@ -33,7 +34,7 @@ DELAY = np.full(3, 3.0)
 
 def run(numbers: np.ndarray, U: np.ndarray, lines: int = 2) -> tuple[np.ndarray, np.ndarray]:
     M, Y = np.empty(U.shape), np.empty((len(U), 2))
-    FUNCTIONS.neck_run(numbers, RIGID, TS, DELAY, lines, 50, U, U[0].copy(), M, Y)
+    FUNCTIONS.neck_run(numbers, RIGID, TS, NECK_SUBSTEPS, DELAY, lines, 50, U, U[0].copy(), M, Y)
     return M, Y
 
 
@@ -89,6 +90,31 @@ def test_no_numbers_and_no_inputs_move_the_tilt_beyond_its_bound() -> None:
         assert np.isfinite(M).all()
         # |bend| <= 1.2 rad, and so pitch and roll.
         assert np.abs(Y).max() <= 1.2 + 1e-12
+
+
+def test_a_search_that_began_with_long_substeps_ends_with_the_error_of_the_equations() -> None:
+    problem = FitProblem.of(ScaledData.of(neck_of(GUESS, 400), amplitudes=False))
+    found = problem.delayed(None, 3, SearchProgress(silent, 1))
+    e = problem.errors(found.x, found.delay)
+    assert found.problem.substeps == NECK_SUBSTEPS != problem.coarse().substeps
+    assert found.cost == 0.5 * float(e @ e)
+    # Substeps of 10 ms for 4 ms move the tilts by a few per cent of their spread, and not by nothing.
+    away = problem.coarse().misses(found.x, found.delay)[0] - problem.misses(found.x, found.delay)[0]
+    assert 0.0 < away.std() < 0.05 * problem.runs[0][3].std()
+
+
+def test_slopes_are_the_limit_of_differences() -> None:
+    problem = FitProblem.of(ScaledData.of(neck_of(GUESS, 400), amplitudes=False))
+    x = np.array([number.encode(number.guess) for number in problem.numbers])
+    J, e = slopes(problem, x, 2), problem.errors(x, 2)
+    assert J.shape == (x.size, e.size)
+    for number, name in enumerate(n.name for n in problem.numbers):
+        if name in ("lever", "gain", "sensor_rate"):  # smooth: no kink of a stalled drive
+            move = np.zeros(x.size)
+            move[number] = 1e-5
+            # A one-sided difference errs by half its step times the curvature, which is about the slope itself.
+            ahead = (problem.errors(x + move, 2) - e) / 1e-5
+            np.testing.assert_allclose(J[number], ahead, rtol=0, atol=1e-3 * np.abs(ahead).max())
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +177,7 @@ def tendons_of(*degrees: float, axes: int = 2) -> np.ndarray:
 
 def run_tendons(numbers: np.ndarray, U: np.ndarray, axes: int) -> np.ndarray:
     M, Y = np.empty(U.shape), np.empty((len(U), axes))
-    FUNCTIONS.neck_run(numbers, RIGID, TS, np.full(U.shape[1], 3.0), 2, 50, U, U[0].copy(), M, Y)
+    FUNCTIONS.neck_run(numbers, RIGID, TS, NECK_SUBSTEPS, np.full(U.shape[1], 3.0), 2, 50, U, U[0].copy(), M, Y)
     return Y
 
 
@@ -196,7 +222,7 @@ def test_its_free_run_is_the_one_that_was_fitted(fitted: Model, truth: np.ndarra
     U = recording.set_points
     M, Y = np.empty(U.shape), np.empty((len(U), 2))
     arrays = fitted.arrays
-    FUNCTIONS.neck_run(arrays["neck"], RIGID, TS, arrays["drive"][:, 1], 2, 50, U, U[0].copy(), M, Y)
+    FUNCTIONS.neck_run(arrays["neck"], RIGID, TS, NECK_SUBSTEPS, arrays["drive"][:, 1], 2, 50, U, U[0].copy(), M, Y)
     free = fitted.simulate(recording, warm_up=1)
     # The echo of the first sample dies out; hysteresis keeps a trace of how the start was held.
     np.testing.assert_allclose(free[200:, :2], Y[200:], rtol=0, atol=1e-4)
