@@ -44,6 +44,7 @@ _DELAY_SOURCES = {
     "given": "as given",
     "sensor": "of the sensor",
     "robot": "of the robot's file; set-points and angles alone give only the sum of drive and sensor delay",
+    "recording": "the nearest to the robot's file that the model's recordings allow; measure it",
     "gyro": "from the gyro's rates",
     "motor positions": "the upper bound from motor positions",
 }

@@ -62,7 +62,7 @@ class NonlinearObserver(SteppedMixin, ReprMixin):
         sensor: name of the preset, or the source of its noise: "none" (given), "robot" (its file), "recording".
         order: of the loop that it runs in.
         gate_level: chi-square level of the gate.
-        delay_source: where the sensor's delay comes from: "given", "sensor", "robot".
+        delay_source: where the sensor's delay comes from: "given", "sensor", "robot", "recording".
     """
 
     model: Model

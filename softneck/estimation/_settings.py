@@ -183,8 +183,12 @@ class KalmanSettings:
             )
         own, robot, period = replace(self, form="nonlinear"), model.robot, model.sample_time
         scaling = model_scaling(model)
-        usual = find_sensor(self.sensor).delay
-        delay, gyro = own._delays(float(robot.require("delay_s", _NAME_IN_MESSAGES) if usual is None else usual))
+        usual, source = find_sensor(self.sensor).delay, "sensor"
+        if usual is None:
+            said = float(robot.require("delay_s", _NAME_IN_MESSAGES))
+            usual = _as_recorded(said, model)
+            source = "robot" if usual == said else "recording"
+        delay, gyro = own._delays(usual)
         noise, sensor = own.levels(robot, scaling, period)
         recorded = max(model.findings.get("sensor", {}).get("noise_std", [0.0]))
         if recorded > noise[0] and sensor in ("paper", "robot"):
@@ -199,7 +203,7 @@ class KalmanSettings:
             sensor=sensor,
             order=self.order,
             gate_level=_GATE_LEVEL,
-            delay_source="given" if self.sensor_delay is not None else "robot" if usual is None else "sensor",
+            delay_source="given" if self.sensor_delay is not None else source,
         )
 
     def _over_linear(self, model: HasTransferFunctions) -> KalmanObserver:
@@ -310,6 +314,13 @@ class KalmanSettings:
         found[2:KALMAN_MORE_LAGS] = rest
         found[KALMAN_MORE_LAGS:] = lags[2:]
         return found
+
+
+def _as_recorded(said: float, model: Model) -> float:
+    """Return the sensor's delay of the robot's file [s], or the nearest that a model's recordings allow; 0 stays."""
+    least, most = model.findings.get("sensor_delay_s", (0.0, None))
+    nearest = max(said, least) if most is None else min(max(said, least), most)
+    return nearest if said > 0.0 else said
 
 
 def _slew(robot: Robot) -> tuple[float, ...] | None:

@@ -126,6 +126,28 @@ def test_its_sensor_is_at_least_as_noisy_as_the_recordings(play: Model) -> None:
     assert tuple(given) == (NOISE, math.radians(0.29))
 
 
+@pytest.mark.parametrize(
+    ("allowed", "lead", "source"),
+    [(None, 0.05, "robot"), ((0.02, 0.049), 0.049, "recording"), ((0.02, 0.051), 0.05, "robot"),
+     ((0.049, 0.08), 0.05, "robot"), ((0.051, 0.08), 0.051, "recording"), ((0.051, None), 0.051, "recording"),
+     ((0.02, None), 0.05, "robot")],
+)  # fmt: skip
+def test_its_sensor_is_as_late_as_the_robots_file_says_within_what_the_recordings_allow(
+    play: Model, allowed: tuple[float, float | None] | None, lead: float, source: str
+) -> None:
+    """The neck's file has 50 ms."""
+    model = replace(play, findings={**play.findings, **({"sensor_delay_s": allowed} if allowed else {})})
+    observer = designed(KalmanSettings(), model)
+    # Kept in samples.
+    assert observer.lead == pytest.approx(lead, abs=1e-12)
+    assert observer.delay_source == source
+    assert ("the model's recordings allow" in observer.summary()) == (source == "recording")
+    # A delay that is given, of the sensor or zero in the robot's file is not questioned.
+    assert designed(KalmanSettings(sensor_delay=0.02), model).lead == pytest.approx(0.02)
+    assert designed(KalmanSettings(sensor="3dm-gx5-10"), model).lead == pytest.approx(0.015)
+    assert designed(KalmanSettings(), replace(model, robot=replace(model.robot, delay_s=0.0))).lead == 0.0
+
+
 @pytest.mark.parametrize("lead", [0.0, 0.04, 0.05])
 def test_in_darkness_it_says_what_the_model_will_say(play: Model, run: Recording, lead: float) -> None:
     """Ahead by the sensor's delay, which is within the model's dead time; parts of a sample by a straight line."""

@@ -256,6 +256,29 @@ def test_it_bends_for_a_neck_that_is_none_of_its_kind_and_without_logged_motors(
     assert np.isfinite(model.simulate(neck_recording(200, positions=False))).all()
 
 
+def test_logged_motors_show_how_late_the_sensor_is_and_set_points_alone_do_not(truth: np.ndarray) -> None:
+    """A dead time of 2 or 4 samples before a lag of 1 / 40 s."""
+    recording = neck_of(truth, 1000)
+    pitch, roll = (np.r_[np.full(2, y[0]), y[:-2]] for y in recording.outputs.T)
+    later = recording.with_channels(pitch=pitch, roll=roll)
+    for log, seconds, longest in ((recording, 0.065, False), (later, 0.105, True)):
+        least, most = GreyBox(body="rigid").fit(log).findings["sensor_delay_s"]
+        # The lag has a prior, and 1,000 rows their noise: a quarter of a sample.
+        assert least == pytest.approx(seconds - 0.025, abs=0.005)
+        # Four samples are the longest dead time that is tried.
+        assert most is None if longest else most - least == pytest.approx(0.03)
+    blind = Recording(
+        recording.time, TS, {name: y for name, y in recording.channels.items() if name not in MOTOR_POSITIONS}
+    )
+    quick = GreyBox(evaluations=1, body="rigid")
+    assert "sensor_delay_s" in quick.fit(recording).findings
+    slow = truth.copy()
+    slow[NAMES.index("sensor_rate")] = 1.0  # beyond the end of its search, which is then not what the data determine
+    beyond = (GreyBox(body="rigid"), neck_of(slow, 1000))
+    for settings, log in ((quick, blind), (replace(quick, sensor_delay=2), recording), beyond):
+        assert "sensor_delay_s" not in settings.fit(log).findings
+
+
 @pytest.mark.slow
 @pytest.mark.nightly
 def test_the_figures_of_the_issue_on_the_virtual_neck() -> None:
