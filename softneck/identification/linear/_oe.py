@@ -85,10 +85,10 @@ def fit_output_error(
     if best is None or not np.isfinite(best[0]):
         return None
     f = best[1]
-    X, y, bases = _columns(runs, f, nb, d, constant)
+    X, y, parts = _columns(runs, f, nb, d, constant)
     b = np.linalg.lstsq(X, y)[0]
     r = y - X @ b
-    J = np.column_stack([_pole_columns(runs, f, b, nb, d, bases), X])
+    J = np.column_stack([_pole_columns(runs, f, b, parts), X])
     cost = float(r @ r)
     covariance = cost / max(y.size - nf - nb - nf * len(runs), 1) * np.linalg.pinv(J.T @ J, hermitian=True)
     covariance = covariance[: nf + nb, : nf + nb]
@@ -111,7 +111,7 @@ def largest_radius(runs: Runs) -> float:
 
 def _exceeds(f: Vector, radius: float) -> bool:
     """Return whether a pole is larger than its bound; one that turns several times in a run may decay hardly at all."""
-    poles = np.roots(np.concatenate([[1.0], f]))
+    poles = _poles(f)
     return bool((np.abs(poles) > _bounds(poles, radius)).any())
 
 
@@ -148,45 +148,57 @@ def _search(runs: Runs, nb: int, d: int, f: Vector, radius: float, constant: boo
 
 def _project_linear(runs: Runs, f: Vector, nb: int, d: int, constant: bool) -> tuple[float, Vector, Matrix]:
     """Return cost, residual and derivative of the prediction by f, with b, constant and starts eliminated."""
-    X, y, starts = _columns(runs, f, nb, d, constant)
-    Q = _orthonormal_basis(X)
-    r = y - Q @ (Q.T @ y)
-    b = np.linalg.lstsq(X, y)[0]
-    S = _pole_columns(runs, f, b, nb, d, starts)
+    X, y, parts = _columns(runs, f, nb, d, constant)
+    Q, to_b = _orthonormal_basis(X)
+    along = Q.T @ y
+    r = y - Q @ along
+    S = _pole_columns(runs, f, to_b @ along, parts)
     return float(r @ r), r, S - Q @ (Q.T @ S)
 
 
-def _columns(runs: Runs, f: Vector, nb: int, d: int, constant: bool) -> tuple[Matrix, Vector, list[Matrix]]:
-    """Return regressors of b and constant (rows, nb or nb + 1), outputs (rows,), and each run's basis of starts."""
-    parts, targets, bases = [], [], []
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """Of one run: `forced` (time, nb) are its inputs through 1/F, `response` (up to time, nf) the starts, `basis` theirs.
+
+    there: (time,) whether its output was measured.
+    """
+
+    forced: Matrix
+    response: Matrix
+    basis: Matrix
+    there: np.ndarray
+
+
+def _columns(runs: Runs, f: Vector, nb: int, d: int, constant: bool) -> tuple[Matrix, Vector, list[_Part]]:
+    """Return regressors of b and constant (rows, nb or nb + 1), outputs (rows,), and the parts of each run."""
+    columns, targets, parts = [], [], []
     for u, y in runs:
         there = np.isfinite(y)
         response = _start_responses(f, u.size)
-        Q = _orthonormal_basis(response[there[: len(response)]])
-        X = _input_columns(u, f, nb, d)
-        X = np.column_stack([X, np.ones(len(X))]) if constant else X
-        parts.append(_project_off(Q, X[there]))
+        Q, _ = _orthonormal_basis(response[there[: len(response)]])
+        forced = _input_columns(u, f, nb, d)
+        X = np.column_stack([forced, np.ones(len(forced))]) if constant else forced
+        columns.append(_project_off(Q, X[there]))
         targets.append(_project_off(Q, y[there]))
-        bases.append(Q)
-    return np.concatenate(parts), np.concatenate(targets), bases
+        parts.append(_Part(forced, response, Q, there))
+    return np.concatenate(columns), np.concatenate(targets), parts
 
 
-def _pole_columns(runs: Runs, f: Vector, b: Vector, nb: int, d: int, bases: list[Matrix]) -> Matrix:
+def _pole_columns(runs: Runs, f: Vector, b: Vector, parts: list[_Part]) -> Matrix:
     """Return the derivative of the output by f, `-q^-i / F y`, without the starts' part; b (nb,), then a constant."""
     F = np.concatenate([[1.0], f])
-    parts = []
-    for (u, y), Q in zip(runs, bases, strict=True):
-        there = np.isfinite(y)
-        forced = _input_columns(u, f, nb, d) @ b[:nb]
+    found = []
+    for (_, y), part in zip(runs, parts, strict=True):
+        there, nb = part.there, part.forced.shape[1]
+        output = part.forced @ b[:nb]
         # F filters the whole output but its constant, with its own start.
-        left = y[there] - forced[there] - b[nb:].sum()
-        response = _start_responses(f, u.size)
-        n = len(response)
-        output = forced
-        output[:n] += response @ np.linalg.lstsq(response[there[:n]], left[: int(there[:n].sum())])[0]
+        n = len(part.response)
+        seen = there[:n]
+        left = y[:n][seen] - output[:n][seen] - b[nb:].sum()
+        output[:n] += part.response @ np.linalg.lstsq(part.response[seen], left)[0]
         S = np.column_stack([_delay(-_filter_all_pole(F, output), i) for i in range(1, f.size + 1)])[there]
-        parts.append(_project_off(Q, S))
-    return np.concatenate(parts)
+        found.append(_project_off(part.basis, S))
+    return np.concatenate(found)
 
 
 def _input_columns(u: Vector, f: Vector, nb: int, d: int) -> Matrix:
@@ -230,10 +242,11 @@ def _filter_all_pole(F: Vector, x: Vector) -> Vector:
     return np.asarray(lfilter([1.0], F, x))
 
 
-def _orthonormal_basis(X: Matrix) -> Matrix:
-    """Return an orthonormal basis of the columns' span."""
-    U, s, _ = np.linalg.svd(X, full_matrices=False)
-    return U[:, s > 1e-12 * max(float(s.max(initial=0.0)), 1e-300)]
+def _orthonormal_basis(X: Matrix) -> tuple[Matrix, Matrix]:
+    """Return an orthonormal basis Q of the columns' span, and M with `X M = Q` of the least norm."""
+    U, s, Vt = np.linalg.svd(X, full_matrices=False)
+    kept = s > 1e-12 * max(float(s.max(initial=0.0)), 1e-300)
+    return U[:, kept], Vt[kept].T / s[kept]
 
 
 def _delay(x: Vector, samples: int) -> Vector:
@@ -242,12 +255,17 @@ def _delay(x: Vector, samples: int) -> Vector:
 
 def pole_radius(f: Vector) -> float:
     """Return the absolute value of the largest root of z^n + f_1 z^(n-1) + ..."""
-    return float(np.abs(np.roots(np.concatenate([[1.0], f]))).max(initial=0.0))
+    return float(np.abs(_poles(f)).max(initial=0.0))
+
+
+def _poles(f: Vector) -> np.ndarray:
+    """Return the roots of z^n + f_1 z^(n-1) + ...; of one pole without an eigenvalue problem."""
+    return -f if f.size == 1 else np.roots(np.concatenate([[1.0], f]))
 
 
 def _limit_poles(f: Vector, radius: float) -> Vector:
     """Return `f` with its poles moved within `radius`."""
-    poles = np.roots(np.concatenate([[1.0], f]))
+    poles = _poles(f)
     size = np.abs(poles)
     bounds = _bounds(poles, radius)
     if (size <= bounds).all():
