@@ -72,6 +72,8 @@ def weighted_median(values: np.ndarray, weights: Vector) -> Matrix:
 SCREENED_ROWS = 2000
 # Part of the rows that each region takes, and how far it reaches into what lies before and after [time constants].
 _REGION, _WIDEN = 0.12, 1.0
+# Sizes of one level differ by less: a mean of them is rounded in another way on each kind of processor.
+_ROUNDING = 1e-9
 # Over how long a motion is fast or slow [time constants].
 _MOVED_OVER = 2.5
 # Runs are left out in so many groups at most; a group of fewer rows says nothing of a simulation.
@@ -238,9 +240,11 @@ def _blank_extreme_motions(recording: Recording, slow: float) -> tuple[Recording
 def _largest_rows(recording: Recording, size: Vector, reach: int) -> np.ndarray:
     """Return (time,) the rows with the largest `size`, and those near them in their run."""
     edge = np.quantile(size, 1.0 - _REGION)
-    inside = size > edge
-    if not inside.any() and 2 * (size == edge).sum() < size.size:
-        inside = size == edge  # steps of few levels: the largest level
+    level = np.isclose(size, edge, rtol=_ROUNDING, atol=0.0)
+    inside = (size > edge) & ~level
+    # Steps of few levels: the largest one, where the others are more than one, or nothing would move without it.
+    if not inside.any() and 2 * level.sum() < size.size and np.ptp(size[~level]) > _ROUNDING * edge:
+        inside = level
     near = np.ones(2 * reach + 1)
     parts = np.split(inside, np.cumsum([len(run) for run in recording.runs()])[:-1])
     return np.concatenate([np.convolve(part, near)[reach : reach + part.size] > 0 for part in parts])
