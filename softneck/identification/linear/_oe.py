@@ -158,9 +158,10 @@ def _project_linear(runs: Runs, f: Vector, nb: int, d: int, constant: bool) -> t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Part:
-    """Of one run: `forced` (time, nb) are its inputs through 1/F, `response` (up to time, nf) the starts, `basis` theirs.
+    """Of one run: its inputs through 1/F, and the responses to its start.
 
-    there: (time,) whether its output was measured.
+    forced: (time, nb); response, basis: (up to time, nf), and orthonormal; there: (time,) whether its output was
+    measured.
     """
 
     forced: Matrix

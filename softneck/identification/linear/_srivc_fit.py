@@ -119,7 +119,7 @@ class SrivcFitOptions:
         for _ in range(12):
             step, n = size * moves[0], self.order
             a, b = fit.model.a + step[:n], fit.model.b + step[n : n + fit.model.b.size]
-            poles = np.roots(np.concatenate([[1.0], a]))
+            poles = -a if n == 1 else np.roots(np.concatenate([[1.0], a]))
             if poles.real.max() <= -slowest and np.abs(poles).max() <= self.fastest:
                 L = fit.model.delay
                 L = float(np.clip(L + step[-1], 0.0, self.max_delay)) if self.free_delay else L
@@ -135,7 +135,8 @@ class SrivcFitOptions:
         self, runs: Runs, model: Continuous, starts: Sequence[Vector]
     ) -> tuple[SrivcFit, tuple[Vector, list[Vector]]]:
         """Return the fit at `model` and the next step, of (a, b, L) and of the starts."""
-        rows = [self._run_columns(u, y, model, start) for (u, y), start in zip(runs, starts, strict=True)]
+        discrete = _Discrete.of(model, self.sample_time, max(u.size for u, _ in runs))
+        rows = [self._run_columns(u, y, discrete, start) for (u, y), start in zip(runs, starts, strict=True)]
         cost = sum(float(r.errors @ r.errors) for r in rows)
         Z = np.concatenate([r.instruments_off for r in rows])
         Phi = np.concatenate([r.regressors_off for r in rows])
@@ -150,32 +151,24 @@ class SrivcFitOptions:
         fit = SrivcFit(model=model, cost=cost, simulated=simulated, starts=starts, information=Z.T @ Z)
         return fit, (step, [r.start_step(step) for r in rows])
 
-    def _run_columns(self, u: Vector, y: Vector, model: Continuous, start: Vector) -> _RunColumns:
+    def _run_columns(self, u: Vector, y: Vector, at: _Discrete, start: Vector) -> _RunColumns:
         """Simulate one run and return its errors, instruments and regressors."""
         n, functions = self.order, load_functions(_CT_RUNTIME)
-        A, e, C = model.canonical()
-        big, drive = np.zeros((3 * n, 3 * n)), np.zeros(3 * n)
-        for i in range(3):
-            big[i * n : (i + 1) * n, i * n : (i + 1) * n] = A
-        big[3 * n - 1, :n] = C
-        big[3 * n - 1, n] += 1.0
-        drive[:n] = e
-        d, old, new, transition = _discretize_zoh(big, drive, model.delay, self.sample_time)
         states = np.zeros((u.size, 3 * n))
         # At rest under the first input before the recording.
-        states[0, 0] = u[0] / model.a[-1]
+        states[0, 0] = u[0] / at.model.a[-1]
         states[0, n : 2 * n] = start[:n]
-        functions.ct_simulate(transition, old, new, u, d, states[0].copy(), states)
-        simulated = states[:, :n] @ C + states[:, n] + (start[n] if self.offset else 0.0)
+        functions.ct_simulate(at.transition, at.old, at.new, u, at.late, states[0].copy(), states)
+        simulated = states[:, :n] @ at.C + states[:, n] + (start[n] if self.offset else 0.0)
         there = np.isfinite(y)
         errors = np.where(there, y - simulated, 0.0)
         filtered = np.zeros((u.size, n))
-        functions.ct_filter(*_discretize_foh(A, e, self.sample_time), errors, filtered)
-        late = np.concatenate([np.full(min(d + 1, u.size), u[0]), u[: max(u.size - d - 1, 0)]])
-        slope = -(states[:, :n] @ (C @ A) + C[-1] * late)
+        functions.ct_filter(*at.filter, errors, filtered)
+        late = np.concatenate([np.full(min(at.late + 1, u.size), u[0]), u[: max(u.size - at.late - 1, 0)]])
+        slope = -(states[:, :n] @ at.slope + at.C[-1] * late)
         columns = np.column_stack([states[:, :1], slope])
         own = -states[:, 2 * n :][:, ::-1]
-        nuisance = _free_responses(A, u.size, self.sample_time)
+        nuisance = at.free[: u.size]
         if self.offset:
             nuisance = np.column_stack([nuisance, np.ones(u.size)])
         return _RunColumns(
@@ -185,6 +178,39 @@ class SrivcFitOptions:
             regressors=np.column_stack([own - filtered[:, ::-1], columns])[there],
             nuisance=nuisance[there],
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Discrete:
+    """A model at a sample time, the same for all runs.
+
+    transition, old, new, late: of the states, their model's response and its derivatives (3 n); filter: of the errors;
+    C, slope: (n,) of the output and of its derivative; free: (longest run, n) responses to a start.
+    """
+
+    model: Continuous
+    transition: Matrix
+    old: Vector
+    new: Vector
+    late: int
+    filter: tuple[Matrix, Vector, Vector]
+    C: Vector
+    slope: Vector
+    free: Matrix
+
+    @classmethod
+    def of(cls, model: Continuous, sample_time: float, longest: int) -> _Discrete:
+        A, e, C = model.canonical()
+        n = e.size
+        big, drive = np.zeros((3 * n, 3 * n)), np.zeros(3 * n)
+        for i in range(3):
+            big[i * n : (i + 1) * n, i * n : (i + 1) * n] = A
+        big[3 * n - 1, :n] = C
+        big[3 * n - 1, n] += 1.0
+        drive[:n] = e
+        late, old, new, transition = _discretize_zoh(big, drive, model.delay, sample_time)
+        free = _free_responses(transition[:n, :n], longest)
+        return cls(model, transition, old, new, late, _discretize_foh(A, e, sample_time), C, C @ A, free)
 
 
 class _RunColumns:
@@ -197,14 +223,21 @@ class _RunColumns:
         self._regressors, self._nuisance = regressors, nuisance
         scale = np.maximum(np.linalg.norm(nuisance, axis=0), 1e-300)
         Q, R = np.linalg.qr(nuisance / scale)
-        Q = Q[:, np.abs(np.diag(R)) > 1e-10]
+        kept = np.abs(np.diag(R)) > 1e-10
+        Q = Q[:, kept]
+        # Q and what gives the start from it, where no column depends on the others.
+        self._basis = (Q, R * scale) if kept.all() else None
         self.instruments_off = instruments - Q @ (Q.T @ instruments)
         self.regressors_off = regressors - Q @ (Q.T @ regressors)
         self.errors_off = errors - Q @ (Q.T @ errors)
 
     def start_step(self, step: Vector) -> Vector:
         """Return the step of the start for a `step` of (a, b, L)."""
-        return np.linalg.lstsq(self._nuisance, self.errors - self._regressors @ step)[0]
+        left = self.errors - self._regressors @ step
+        if self._basis is None:
+            return np.linalg.lstsq(self._nuisance, left)[0]
+        Q, R = self._basis
+        return np.linalg.solve(R, Q.T @ left)
 
 
 def _discretize_zoh(A: Matrix, e: Vector, delay: float, sample_time: float) -> tuple[int, Vector, Vector, Matrix]:
@@ -235,17 +268,14 @@ def _discretize_foh(A: Matrix, e: Vector, Ts: float) -> tuple[Matrix, Vector, Ve
     return E[:n, :n], E[:n, n] - E[:n, n + 1], E[:n, n + 1]
 
 
-def _free_responses(A: Matrix, size: int, sample_time: float) -> Matrix:
-    """Return the first row of exp(A t), (size, n), a basis of the responses to a start."""
-    from scipy.linalg import expm
-
-    n = A.shape[0]
-    Ad = np.asarray(expm(A * sample_time))
-    rows = np.zeros((size, n))
-    states = np.zeros((size, n))
-    zero = np.zeros(n)
+def _free_responses(Ad: Matrix, size: int) -> Matrix:
+    """Return the first rows of Ad^k, (size, n), a basis of the responses to a start."""
+    n = len(Ad)
+    rows, states, zero = np.zeros((size, n)), np.zeros((size, n)), np.zeros(n)
     for i in range(n):
-        load_functions(_CT_RUNTIME).ct_simulate(Ad, zero, zero, np.zeros(size), 0, np.eye(n)[i], states)
+        load_functions(_CT_RUNTIME).ct_simulate(
+            np.ascontiguousarray(Ad), zero, zero, np.zeros(size), 0, np.eye(n)[i], states
+        )
         rows[:, i] = states[:, 0]
     return rows
 
