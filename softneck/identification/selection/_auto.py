@@ -247,12 +247,12 @@ def choose(
 ) -> Choice:
     """Compare every kind by simulation of data left out, train the best on all of `train`, and choose.
 
-    Each kind is identified in a short form on a part of the rows without their largest and fastest motions, later
-    without one run or recording after the other, and judged on these, on `hold_out` and by how well it agrees with the
-    others on motions that nobody recorded. The least of these scores ranks. After each training the better half goes
-    on. The best, of those alike the one of the fewest numbers, is trained on all rows and judged on `hold_out` again,
-    from the first row only as well; where it then falls behind the next, that one is trained too. So is the best linear
-    kind, which controllers are designed on, or the best nonlinear one where the chosen is linear.
+    Each kind is identified in a short form on a part of the rows without their largest and fastest motions, and judged
+    on these, on `hold_out` and by how well it agrees with the others on motions that nobody recorded. The least of
+    these scores ranks. One run, recording or phase after the other is then left out of the best so far, until no other
+    could still win. The best, of those alike the one of the fewest numbers, is trained on all rows and judged on
+    `hold_out` again, from the first row only as well; where it then falls behind the next, that one is trained too. So
+    is the best linear kind, which controllers are designed on, or the best nonlinear one where the chosen is linear.
 
     Of a learned kind that wins, the guarded form is taken: it falls back to
     the better of `greybox` and `oe` where its members part. A kind that fails is listed with its reason.
@@ -277,8 +277,7 @@ def choose(
     race = _Race(train, hold_out, folds(train, hold_out, other_excitation=other_excitation), seed)
     race.screen_all(wanted, lambda done, what: progress(0.7 * done, what))
     race.examine()
-    race.leave_out(lambda done, what: progress(0.7 + 0.1 * done, what))
-    best = race.train_best(lambda done, what: progress(0.8 + 0.1 * done, what))
+    best = race.train_best(lambda done, what: progress(0.7 + 0.2 * done, what))
     chosen = race.finish(best, lambda done, what: progress(0.9 + 0.1 * done, what))
     ranking = race.ranking()
     progress(1.0, f"chosen: {chosen.kind}")
@@ -317,6 +316,8 @@ class _Race:
         self._motions: list[Recording] = []
         self._free: dict[str, list[Matrix]] = {}
         self._worth: dict[str, float] = {}
+        # How many folds a kind went through, if more than the first.
+        self._left_out: dict[str, int] = {}
 
     def ranking(self) -> tuple[KindTrial, ...]:
         """Return all kinds, the best first."""
@@ -361,16 +362,6 @@ class _Race:
             one = self.tried[kind]
             self.tried[kind] = replace(one, left_out={**one.left_out, EXAM: fit})
 
-    def leave_out(self, progress: Progress) -> None:
-        """Go through the other folds with the better half of those that are left."""
-        running = [one for one in self.ranking() if one.fit > float("-inf")]
-        for number, fold in enumerate(self.folds[1:], start=1):
-            running = sorted(running, key=lambda one: -self.tried[one.kind].fit)
-            running = running[: max(-(-len(running) // 2), 2)]
-            names = [one.kind for one in running]
-            progress(number / len(self.folds), f"{', '.join(names)} without {fold.judged[0].name}")
-            side_by_side([partial(self._leave_out, kind, fold) for kind in names])
-
     def _leave_out(self, kind: str, fold: Fold) -> None:
         begin = time.perf_counter()
         try:
@@ -383,16 +374,26 @@ class _Race:
         self.tried[kind] = _with(replace(one, seconds=one.seconds + time.perf_counter() - begin), found)
 
     def train_best(self, progress: Progress) -> KindTrial:
-        """Train the best kinds on all rows until the best one is trained; return it."""
+        """Leave the next part out of the best kind, or train it on all rows, until the best is through; return it.
+
+        As no part raises the lowest fit, the others could not have won (branch and bound).
+        """
         trained = 0
         while True:
             best = self._simplest_of_the_best()
+            number = self._left_out.get(best.kind, 1)
+            if number < len(self.folds):
+                fold = self.folds[number]
+                progress(0.5 * number / len(self.folds), f"{best.kind} without {fold.judged[0].name}")
+                self._leave_out(best.kind, fold)
+                self._left_out[best.kind] = number + 1
+                continue
             if best.whole:
                 return best
             done = [one for one in self.ranking() if one.whole and one.fit > float("-inf")]
             if trained >= _MOST_TRAINED and done:
                 return done[0]
-            progress(0.0, f"{best.kind} on all rows to train on")
+            progress(0.5, f"{best.kind} on all rows to train on")
             self.whole(best.kind)
             trained += 1
 

@@ -477,28 +477,53 @@ def test_a_kind_that_fails_in_its_whole_training_keeps_its_reason(made: bool, mo
     assert len(fitted) == made  # one that could not be made short is not made whole
 
 
-def test_each_later_part_is_left_out_of_the_better_half_of_those_that_ran(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_later_parts_are_left_out_of_the_best_alone_until_no_other_could_win(monkeypatch: pytest.MonkeyPatch) -> None:
     race, fitted = racing(monkeypatch, more=3)
-    fits = {"rls": 60.0, "oe": 90.0, "play": 75.0, "greybox": float("-inf"), "nlsm": 80.0, "nn": 50.0}
+    fits = {"rls": 60.0, "oe": 90.0, "play": 75.0, "greybox": float("-inf"), "nlsm": 69.0, "nn": 50.0}
     race.tried = {kind: ran(kind, fit) for kind, fit in fits.items()}
+    race.short["oe"] = "short"  # pyright: ignore[reportArgumentType]
+    monkeypatch.setattr(_auto, "numbers_of", lambda model: 5 + (not str(model).startswith("oe")))
     said: list[tuple[float, str]] = []
     begin = time.perf_counter()
-    race.leave_out(lambda share, what: said.append((share, what)))
-    # Of five that ran three go on, then two; all of these score 70 there, so the order stays.
-    trained = [(len(rows), kind) for kind, _, _, rows in fitted]
-    assert [rows for rows, _ in trained] == [700] * 3 + [699] * 2 + [698] * 2
-    # Those of one part are trained side by side.
-    assert sorted(trained) == sorted([*[(700, kind) for kind in ("oe", "nlsm", "play")],
-                                      *[(rows, kind) for rows in (699, 698) for kind in ("oe", "nlsm")]])  # fmt: skip
-    assert [text for _, text in said] == [
-        "oe, nlsm, play without run 0", "oe, nlsm without run 1", "oe, nlsm without run 2",
+    found = race.train_best(lambda share, what: said.append((share, what)))
+    # All score 70 on a later part: `oe` falls behind `play`, which then falls to it; 69 could not have won.
+    assert [(kind, len(rows)) for kind, _, _, rows in fitted] == [
+        ("oe", 700), ("play", 700), ("oe", 699), ("oe", 698), ("oe", 900),
     ]  # fmt: skip
-    shares = [share for share, _ in said]
-    assert shares == sorted(shares)
-    assert set(shares) == {0.25, 0.5, 0.75}
+    assert (found.kind, found.whole) == ("oe", True)
+    assert said == [
+        (0.125, "oe without run 0"), (0.125, "play without run 0"), (0.25, "oe without run 1"),
+        (0.375, "oe without run 2"), (0.5, "oe on all rows to train on"),
+    ]  # fmt: skip
     assert race.tried["oe"].left_out == {"a": 90.0, "run 0": 70.0, "run 1": 70.0, "run 2": 70.0}
     assert race.tried["rls"].left_out == {"a": 60.0}
     assert all(1.0 <= one.seconds <= 1.0 + time.perf_counter() - begin for one in race.tried.values())
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_winner_is_the_one_that_all_parts_of_all_kinds_would_choose(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng, kinds, parts = np.random.default_rng(seed), ("rls", "oe", "play", "nlsm"), 4
+    race, _ = racing(monkeypatch, more=parts - 1)
+    # No two of them are alike, and training on all rows changes none.
+    told = dict(zip(kinds, rng.permutation(len(kinds) * parts).reshape(-1, parts) * 5.0, strict=True))
+    race.tried = {kind: ran(kind, told[kind][0]) for kind in kinds}
+    number = {id(fold): k for k, fold in enumerate(race.folds)}
+    left: list[tuple[str, int]] = []
+
+    def leave_out(kind: str, fold: Any) -> None:
+        k = number[id(fold)]
+        left.append((kind, k))
+        one = race.tried[kind]
+        race.tried[kind] = replace(one, left_out={**one.left_out, str(k): told[kind][k]})
+
+    monkeypatch.setattr(race, "_leave_out", leave_out)
+    monkeypatch.setattr(race, "whole", lambda kind: race.tried.update({kind: replace(race.tried[kind], whole=True)}))
+    best = max(kinds, key=lambda kind: told[kind].min())
+    found = race.train_best(silent)
+    assert (found.kind, found.fit) == (best, told[best].min())
+    assert len(set(left)) == len(left)  # no part twice
 
 
 @pytest.mark.parametrize(
