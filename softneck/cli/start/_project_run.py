@@ -27,6 +27,7 @@ from softneck.core import (
     SettingsError,
     SoftneckError,
     core_count,
+    cores_taken,
     file_hash,
     settings_text,
     write_text,
@@ -129,6 +130,10 @@ class ProjectRun:
                 words = [*step.command[1:]]
             self.begun[step.key] = _Process.of(words, step.makes, _hashes(step))
 
+    def _running(self) -> int:
+        """Return how many processes run beside this one, each on a core of its own."""
+        return sum(process.running.poll() is None for process in self.begun.values())
+
     def _was_begun(self, step: Step) -> bool:
         """Wait for a step that has begun and tell what it said; return whether it needs no other run.
 
@@ -148,7 +153,8 @@ class ProjectRun:
         entry, begin, ended = self.done[step.key], _processor_time(), True
         entry |= {"holds": not step.finding, "said": step.finding}
         try:
-            with _ctrl_c_ends(), contextlib.redirect_stdout(io.StringIO() if self.as_json else sys.stdout):
+            said = io.StringIO() if self.as_json else sys.stdout
+            with _ctrl_c_ends(), contextlib.redirect_stdout(said), cores_taken(self._running()):
                 if not self._was_begun(step):
                     (_pytest if words[0] == "python" else _softneck)(words, as_json=self.as_json)
         except CheckFailedError as error:
