@@ -82,8 +82,7 @@ def preset_table(name: str) -> dict[str, Any]:
 def fields(table: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of `Robot` for the tables of a file, with the values of the preset that it extends.
 
-    Raises:
-        SettingsError: an unknown key, or a value of the wrong type.
+    Raises SettingsError: an unknown key, or a value of the wrong type.
     """
     _check(table)
     whole = _extend(table)

@@ -35,8 +35,7 @@ def redefinition_of(weights: Matrix, names: tuple[str, ...]) -> tuple[Matrix, Ma
         weights: (outputs, motors) of the motors in each output's direction.
         names: of the outputs, for the message.
 
-    Raises:
-        SettingsError: the motors cannot move all outputs independently.
+    Raises SettingsError: the motors cannot move all outputs independently.
     """
     _, s, Vh = np.linalg.svd(weights / np.linalg.norm(weights, axis=1, keepdims=True))
     outputs, motors = weights.shape

@@ -136,8 +136,7 @@ class Arrays(_Layout):
     def read(cls, arrays: Mapping[str, np.ndarray]) -> dict[str, Matrix]:
         """Return a file's arrays in the order of the declaration.
 
-        Raises:
-            FileFormatError: an array whose shape does not fit the others, or whose numbers are not finite.
+        Raises FileFormatError: an array whose shape does not fit the others, or whose numbers are not finite.
         """
         found: dict[str, Matrix] = {name: np.ascontiguousarray(arrays[name], dtype=np.float64) for name in cls.fields}
         for name, item in found.items():
@@ -150,8 +149,7 @@ class Arrays(_Layout):
     def lengths(cls, arrays: Mapping[str, Matrix]) -> dict[str, int]:
         """Return the symbols of the shapes of `arrays`.
 
-        Raises:
-            FileFormatError: an array whose shape does not fit the others.
+        Raises FileFormatError: an array whose shape does not fit the others.
         """
         known: dict[str, int] = {}
         # Plain symbols first: `k * n` may come before the array with length k.

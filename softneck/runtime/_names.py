@@ -27,8 +27,7 @@ def lower(
         where: the module, for messages.
         sizes: values of the `written` symbols.
 
-    Raises:
-        SettingsError: an undeclared name, or a use of a part of a state that has no contiguous indices.
+    Raises SettingsError: an undeclared name, or a use of a part of a state that has no contiguous indices.
     """
 
     def layout(annotation: ast.expr | None) -> Any:

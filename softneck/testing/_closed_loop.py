@@ -82,8 +82,7 @@ class Outcome:
             limits: as in a loop file, such as {"pitch.overshoot_pct": 10.0}.
             named: metrics of the stepped axis, such as overshoot_pct=10.0, or of the motors.
 
-        Raises:
-            LimitsExceeded: a limit does not hold; the plot is saved.
+        Raises LimitsExceeded: a limit does not hold; the plot is saved.
         """
         table = self.result.metrics
         wanted = {self._full(name, table): limit for name, limit in {**(limits or {}), **named}.items()}

@@ -216,8 +216,7 @@ def moving(
 def sensor_of(file: DrivesFile) -> Any:
     """Return the inclinometer that the drives file names, open until the command ends.
 
-    Raises:
-        SoftneckError: see `open_sensor`; nothing was sent to the drives yet.
+    Raises SoftneckError: see `open_sensor`; nothing was sent to the drives yet.
     """
     return click.get_current_context().with_resource(_open_sensor(file))
 

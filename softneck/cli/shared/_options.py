@@ -138,8 +138,7 @@ _ANGLES = {"phase_margin", "inclination_step", "angle_limit"}
 def in_si(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
     """Return setting and value in SI of a key that ends in a unit: `delay_ms`, `phase_margin_deg`, `epsilon_mm`.
 
-    Raises:
-        SettingsError: a unit of another quantity than the setting's.
+    Raises SettingsError: a unit of another quantity than the setting's.
     """
     name, _, unit = key.rpartition("_")
     if key in fields or name not in _TIMES | _OF_CHANNELS | _ANGLES or name not in fields:

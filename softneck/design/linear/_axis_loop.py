@@ -71,8 +71,7 @@ def conditioning_gain(A: Matrix, B: Matrix, C: Matrix, D: float) -> Matrix:
 def innovations_gain(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> Matrix:
     """Return the gain L (n, m) of the innovations form of `v = C x + D r`, x+ = A x + B r, for r as white noise.
 
-    Raises:
-        SettingsError: a mode that is not stable does not show in v.
+    Raises SettingsError: a mode that is not stable does not show in v.
     """
     from scipy.linalg import solve_discrete_are
 
@@ -337,8 +336,7 @@ def leading_filter(
 ) -> ReferenceFilter:
     """Return the reference filter with T2 = `time` [s] whose zero cancels the part `lead` of the nominal loop's lag.
 
-    Raises:
-        SettingsError: a loop that does not rise by itself has none.
+    Raises SettingsError: a loop that does not rise by itself has none.
     """
     if lead == 0.0:
         return ReferenceFilter(time)

@@ -46,8 +46,7 @@ class AxisController:
     def conditioning(self) -> Matrix:
         """Return L (n, 1).
 
-        Raises:
-            SettingsError: no direct gain from the reference and no L given, or an unstable conditioned state.
+        Raises SettingsError: no direct gain from the reference and no L given, or an unstable conditioned state.
         """
         if self.L is None and self.Dr == 0.0:
             raise SettingsError("a controller without direct gain from the reference needs `L` for its conditioning.")

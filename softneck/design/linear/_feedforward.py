@@ -93,8 +93,7 @@ def _steps(
 def _fit_plant(u: Matrix, y: Matrix, plant: AxisPlant) -> AxisPlant:
     """Return the lag with dead time whose responses to inputs (runs, time) are nearest to `y`.
 
-    Raises:
-        SettingsError: nothing moves, or the wrong way.
+    Raises SettingsError: nothing moves, or the wrong way.
     """
     from scipy.optimize import minimize_scalar
     from scipy.signal import lfilter

@@ -121,8 +121,7 @@ class LoopSettings:
 def reference_numbers(given: Any) -> tuple[float | None, float, float]:
     """Return T2 [s], lead and feedforward of a `reference_time`, which gives all, the first two or T2 alone.
 
-    Raises:
-        SettingsError: no such filter.
+    Raises SettingsError: no such filter.
     """
     numbers = list(given) if isinstance(given, list | tuple) else [None if given == PLANT else given, 0.0]
     if len(numbers) not in (2, 3):
@@ -353,8 +352,7 @@ class AxisSettings(LoopSettings, ABC):
     ) -> AxisDesign:
         """Return the result of `build(speed)` for the largest speed [rad/s] at which all loops keep `max_sensitivity`.
 
-        Raises:
-            SettingsError: not even the lowest does.
+        Raises SettingsError: not even the lowest does.
         """
         best: AxisDesign | None = None
 
@@ -445,8 +443,7 @@ def axis_test(plant: AxisPlant, limits: ControllerLimits, inverse: Matrix) -> St
 def least_filter(keeps: Callable[[int], bool], low: int, high: int, sample_time: float, overshoot_pct: float) -> float:
     """Return the smallest filter time [s] of `low` to `high` samples that keeps the overshoot.
 
-    Raises:
-        SettingsError: not even `high` does.
+    Raises SettingsError: not even `high` does.
     """
     if keeps(low):
         return low * sample_time

@@ -62,11 +62,7 @@ class ScaledPlant:
 
 
 def scaled_plant(plant: UncertainPlant | CoupledPlant, *, identified: bool = False) -> ScaledPlant:
-    """Return a plant in scaled quantities.
-
-    Raises:
-        SettingsError: the robot does not say where its set-points end.
-    """
+    """Return a plant in scaled quantities. Raises SettingsError: the robot does not say where its set-points end."""
     robot, axes = plant.robot, list(plant.axes.values())
     (T, inverse), m = (part.copy() for part in plant.redefinition), len(axes)
     scaling = plants_scaling(robot, [axis.nominal for axis in axes], T[:m], "a controller")
@@ -97,8 +93,7 @@ def scaled_plant(plant: UncertainPlant | CoupledPlant, *, identified: bool = Fal
 def predictive_limits(settings: Any, plant: ScaledPlant) -> ControllerLimits:
     """Return the limits of a predictive controller: the robot's, and the lead of its settings.
 
-    Raises:
-        SettingsError: one that the robot does not have, that its file does not give, or that contradicts another.
+    Raises SettingsError: one that the robot does not have, that its file does not give, or that contradicts another.
     """
     robot, scaling = plant.robot, plant.scaling
     (factor, _), unit, lead = to_si(robot.motors.unit), robot.motors.unit, settings.lead_limit

@@ -321,11 +321,7 @@ def terminal_matrix(p: Problem) -> Matrix:
 
 
 def matrices(problem: Problem) -> Matrices:
-    """Return the QP's matrices out of the expression.
-
-    Raises:
-        SettingsError: the cost is not strictly convex.
-    """
+    """Return the QP's matrices out of the expression. Raises SettingsError: the cost is not strictly convex."""
     import casadi as ca
 
     e = expression(problem)

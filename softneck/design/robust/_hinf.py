@@ -194,8 +194,7 @@ class Partition:
 def partition(A: Matrix, B: Matrix, C: Matrix, D: Matrix, *, nmeas: int, ncon: int) -> Partition:
     """Return the plant scaled to the form of Zhou, Doyle and Glover (1996), sec. 17.1.
 
-    Raises:
-        SettingsError: D12 without full column rank, or D21 without full row rank; both make solvers hang or lie.
+    Raises SettingsError: D12 without full column rank, or D21 without full row rank; both make solvers hang or lie.
     """
     m1, p1 = B.shape[1] - ncon, C.shape[0] - nmeas
     D11, D12, D21, D22 = D[:p1, :m1], D[:p1, m1:], D[p1:, :m1], D[p1:, m1:]
@@ -219,11 +218,7 @@ def partition(A: Matrix, B: Matrix, C: Matrix, D: Matrix, *, nmeas: int, ncon: i
 
 
 def least_gamma(plant: Partition) -> float:
-    """Return the optimal gamma, at most 0.01 % too large.
-
-    Raises:
-        SettingsError: none up to 1e8.
-    """
+    """Return the optimal gamma, at most 0.01 % too large. Raises SettingsError: none up to 1e8."""
     solve, low, high = _riccati_pair(plant), 0.0, 1.0
     while solve(high) is None:
         low, high = high, 4.0 * high

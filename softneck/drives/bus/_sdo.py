@@ -76,20 +76,12 @@ class Objects:
         self._client.network = _Network(link, self._client, 0x580 + node)  # pyright: ignore[reportAttributeAccessIssue]
 
     def read(self, index: int, subindex: int = 0) -> int:
-        """Return a number.
-
-        Raises:
-            SdoError: the drive has no such object or does not answer.
-        """
+        """Return a number. Raises SdoError: the drive has no such object or does not answer."""
         kind = _number(index, subindex)
         return self._call(index, subindex, lambda: kind.unpack(self._client.upload(index, subindex))[0])
 
     def has(self, index: int, subindex: int = 0) -> bool:
-        """Return whether the drive has a number there.
-
-        Raises:
-            SdoError: the drive does not answer.
-        """
+        """Return whether the drive has a number there. Raises SdoError: the drive does not answer."""
         try:
             self.read(index, subindex)
         except SdoError as error:
@@ -104,11 +96,7 @@ class Objects:
         return data.decode("ascii", "ignore").strip("\0 ")
 
     def write(self, index: int, subindex: int, value: int) -> None:
-        """Write a number.
-
-        Raises:
-            SdoError: the drive refuses it or does not answer.
-        """
+        """Write a number. Raises SdoError: the drive refuses it or does not answer."""
         kind = _number(index, subindex)
         # A type without sign takes the bits of a negative number.
         data = (value & ((1 << 8 * kind.size) - 1)).to_bytes(kind.size, "little")

@@ -51,8 +51,7 @@ _NEEDS = {"serial": "port", "python": "python"}
 def make_source(kind: str, table: Mapping[str, Any], folder: Path) -> SensorSource:
     """Return the source that the keys `SOURCE_KEYS` of a table [sensor] describe.
 
-    Raises:
-        SettingsError: an unknown kind, a key of another type, or one that the kind needs is missing.
+    Raises SettingsError: an unknown kind, a key of another type, or one that the kind needs is missing.
     """
     require_one_of("[sensor] kind", kind, SENSORS)
     values: dict[str, Any] = {}

@@ -57,8 +57,7 @@ class DriveScale:
 def position_to_counts(position: float, scale: DriveScale) -> int:
     """Return the encoder counts nearest to a winch position [rad] (607Ah, 6064h).
 
-    Raises:
-        DataError: beyond what 32 bits hold.
+    Raises DataError: beyond what 32 bits hold.
     """
     return _whole("position", position, scale.counts_per_radian, "rad", _INT32)
 
@@ -71,8 +70,7 @@ def counts_to_position(counts: int, scale: DriveScale) -> float:
 def speed_to_internal(speed: float, scale: DriveScale) -> int:
     """Return the internal units nearest to a winch speed [rad/s] (6081h, 60FFh, 606Ch).
 
-    Raises:
-        DataError: beyond what 32 bits hold.
+    Raises DataError: beyond what 32 bits hold.
     """
     return _whole("speed", speed, _speed_factor(scale), "rad/s", _INT32)
 
@@ -85,8 +83,7 @@ def internal_to_speed(units: int, scale: DriveScale) -> float:
 def acceleration_to_internal(acceleration: float, scale: DriveScale) -> int:
     """Return the internal units nearest to a winch acceleration [rad/s^2] (6083h, 6085h).
 
-    Raises:
-        DataError: beyond what 32 bits hold.
+    Raises DataError: beyond what 32 bits hold.
     """
     return _whole("acceleration", acceleration, _speed_factor(scale) * scale.slow_loop, "rad/s^2", _INT32)
 
@@ -94,8 +91,7 @@ def acceleration_to_internal(acceleration: float, scale: DriveScale) -> int:
 def current_to_internal(current: float, scale: DriveScale) -> int:
     """Return the internal units nearest to a motor current [A]: `current * 65520 / (2 I_peak)`.
 
-    Raises:
-        DataError: beyond what 16 bits hold, which is the peak current of the drive.
+    Raises DataError: beyond what 16 bits hold, which is the peak current of the drive.
     """
     return _whole("current", current, _current_factor(scale), "A", _INT16)
 

@@ -126,11 +126,7 @@ def encode_cycle(cycle: Cycle) -> dict[str, Any]:
 
 
 def decode_cycle(table: dict[str, Any]) -> Cycle:
-    """Return the cycle of a table from `encode_cycle`.
-
-    Raises:
-        KeyError, TypeError, ValueError: not such a table.
-    """
+    """Return the cycle of a table from `encode_cycle`. Raises KeyError, TypeError, ValueError: not such a table."""
     tilt = table.get("tilt")
     return Cycle(
         float(table["time"]),
@@ -156,11 +152,7 @@ def frame_text(frame: Frame) -> str:
 
 
 def frame_of(text: str) -> Frame:
-    """Return the frame of a text from `frame_text`.
-
-    Raises:
-        ValueError: not such a text.
-    """
+    """Return the frame of a text from `frame_text`. Raises ValueError: not such a text."""
     number, _, data = text.partition("#")
     digits = data.lstrip("RX")
     kind = data[: len(data) - len(digits)]

@@ -101,8 +101,7 @@ class SerialInclinometer:
             request: the firmware sends a line for each "i" only.
             start: time-out for the first sample [s].
 
-        Raises:
-            SensorError: no such port, no permission, silent, or another protocol; one line.
+        Raises SensorError: no such port, no permission, silent, or another protocol; one line.
         """
         import serial
 

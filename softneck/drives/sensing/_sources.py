@@ -58,11 +58,7 @@ class CanInclinometer:
     """Reader of the slopes that node `node` sends in its first TPDO."""
 
     def __init__(self, node: int, axes: int = 2) -> None:
-        """Listen for the identifier 180h + node.
-
-        Raises:
-            SettingsError: neither one axis nor two.
-        """
+        """Listen for the identifier 180h + node. Raises SettingsError: neither one axis nor two."""
         if axes not in _SLOPES:
             raise SettingsError(
                 f'[sensor] kind = "can" has one axis or two; the robot has {axes} outputs. Write kind = "python".'

@@ -64,8 +64,7 @@ class DriveQuirks:
 def quirks_of(texts: Sequence[str]) -> DriveQuirks:
     """Return the quirks of texts NAME=VALUE, with values as in TOML: `sdo_latency=0.05`, `lacks=[0x1003]`.
 
-    Raises:
-        SettingsError: an unknown quirk, or a value of another type.
+    Raises SettingsError: an unknown quirk, or a value of another type.
     """
     defaults = {field.name: field.default for field in fields(DriveQuirks)}
     given: dict[str, Any] = {}

@@ -96,11 +96,7 @@ class SimulatedSprings(SimulatedDrives):
         self.newest = self._last = Sample(0.0, nothing, nothing, valid=True)
 
     def set(self, **disturbance: float) -> None:
-        """Refuse disturbances, as springs take no load.
-
-        Raises:
-            SettingsError: a disturbance that is not zero.
-        """
+        """Refuse disturbances, as springs take no load. Raises SettingsError: a disturbance that is not zero."""
         for name, value in disturbance.items():
             if value:
                 raise SettingsError(f"`{name}`: simulated drives that turn springs take no load; leave it out.")

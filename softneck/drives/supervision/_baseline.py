@@ -116,8 +116,7 @@ class Baseline:
     def from_dict(cls, table: Mapping[str, Any]) -> Baseline:
         """Return the baseline for a table of `asdict`, also with lists in place of tuples.
 
-        Raises:
-            SettingsError: missing or unknown keys.
+        Raises SettingsError: missing or unknown keys.
         """
         known = {item.name for item in fields(cls)}
         # Files from before the comparison of loops have no `tracking`.
@@ -129,11 +128,7 @@ class Baseline:
 
 
 def load_baseline(path: str | Path) -> Baseline:
-    """Read a baseline from a file of `Baseline.save`.
-
-    Raises:
-        FileFormatError: no such file, or another kind of file.
-    """
+    """Read a baseline from a file of `Baseline.save`. Raises FileFormatError: no such file, or another kind of file."""
     source = Path(path)
     try:
         table = json.loads(settings_text(source, MOST_JSON))

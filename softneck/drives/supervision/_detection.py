@@ -194,8 +194,7 @@ class Budget:
 def thresholds(scores: list[Matrix], budget: Budget, rng: np.random.Generator) -> Vector:
     """Return the thresholds h (charts,) from scores on undisturbed motion, one array (time, charts) for each segment.
 
-    Raises:
-        DataError: less than ten blocks of motion, or scores that are not finite.
+    Raises DataError: less than ten blocks of motion, or scores that are not finite.
     """
     largest = window_maxima(scores, budget, rng)
     border = np.quantile(largest, 1.0 - _TAIL_SHARE, axis=0)

@@ -89,8 +89,7 @@ def compile_here(sources: Sources, compiler: list[str]) -> bytes:
 def compile_for(sources: Sources, platform: Platform) -> bytes:
     """Cross-compile the library for any platform with zig.
 
-    Raises:
-        SettingsError: zig is not installed, or rejects the sources.
+    Raises SettingsError: zig is not installed, or rejects the sources.
     """
     if not have_zig():
         raise SettingsError("zig is not installed; install it with `pip install ziglang`.")

@@ -152,8 +152,7 @@ def generation_tool() -> str:
 def model_description(block: Block, info: FmuInfo, identity: Identity, *, fmi: int = 2) -> bytes:
     """Return the XML text of the model description of FMI 2.0 or 3.0.
 
-    Raises:
-        SettingsError: two ports with one name, or in FMI 3.0 a port called `time`.
+    Raises SettingsError: two ports with one name, or in FMI 3.0 a port called `time`.
     """
     _check_names(block, _TIME_NAME if fmi == 3 else "")
     root = Element("fmiModelDescription", _head(block, info, identity, fmi))

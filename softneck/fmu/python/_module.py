@@ -66,8 +66,7 @@ class SlaveModule:
 def slave_module(runtime: str) -> SlaveModule:
     """Return the module of the FMU of runtime module `runtime`.
 
-    Raises:
-        SettingsError: the runtime defines a name that the slave uses.
+    Raises SettingsError: the runtime defines a name that the slave uses.
     """
     text = bundle(runtime)
     files = [Path(_numba_cache.__file__), *(Path(__file__).with_name(name) for name in _SLAVE_FILES)]

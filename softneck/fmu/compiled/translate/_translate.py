@@ -71,8 +71,7 @@ class Unit:
     def add(self, module: str, ranks: tuple[int, ...], *, tangent: bool = False) -> None:
         """Add runtime `module`, whose arrays have `ranks`, and with `tangent` the derivative of its step.
 
-        Raises:
-            TranslationError: it has a construct without translation; the unit is unchanged.
+        Raises TranslationError: it has a construct without translation; the unit is unchanged.
         """
         before = (list(self.types.declarations), list(self.functions), dict(self._bodies))
         arrays = Arrays(ranks)
@@ -103,8 +102,7 @@ class Unit:
     def tangent(self, module: str, ranks: tuple[int, ...]) -> str:
         """Add the derivative of a runtime's step (see `softneck.runtime._tangent`), and return its name in C.
 
-        Raises:
-            TranslationError: it has a construct without translation.
+        Raises TranslationError: it has a construct without translation.
         """
         runtime = _Runtime(self, with_tangent(bundle(module, loops=False)))
         return _tangent_of(runtime, Arrays(ranks))
@@ -312,8 +310,7 @@ def _zero(kind: Type) -> str:
 def with_single_tangent(text: str) -> str:
     """Return the bundle `text` with its `step_tangent` (see `softneck.runtime._tangent`) for a single direction.
 
-    Raises:
-        TangentError: the step has no derivative.
+    Raises TangentError: the step has no derivative.
     """
     return ast.unparse(ast.fix_missing_locations(_OneDirection().visit(ast.parse(with_tangent(text)))))
 
