@@ -28,12 +28,7 @@ from .models._validity import limit_validity
 from .structured._parameters import PARAMETERS
 
 # Kind -> the arrays that are moved; entries that are zero are structure and stay.
-_ADAPTED_ARRAYS = {
-    "oe": ("a", "b", "A", "B", "offset"),
-    "play": ("weights",),
-    "nn": ("w3", "b3"),
-    "greybox": ("neck",),
-}
+_ADAPTED_ARRAYS = {"oe": ("a", "b", "A", "B", "offset"), "play": ("weights",), "nn": ("w3", "b3"), "greybox": ("neck",)}
 #: Kinds that can adapt.
 ADAPTING = tuple(_ADAPTED_ARRAYS)
 
@@ -386,11 +381,7 @@ def _accept_if_better(model: Model, window: Recording, problem: Problem, z: Vect
         adapted=True, why="", seconds=seconds, rows=rows, before=before, after=best[2], part=best[0]
     )
     new = _update_validity(best[1], window)
-    findings = {
-        **model.findings,
-        **trained_set_points(window, model.findings),
-        "adaptation": said.as_dict(),
-    }
+    findings = {**model.findings, **trained_set_points(window, model.findings), "adaptation": said.as_dict()}
     rows_seen = np.unique(np.concatenate([model.training_rows, row_hashes(window)]))
     return replace(new, findings=findings, training_rows=rows_seen)
 

@@ -10,15 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import (
-    FileFormatError,
-    ReprMixin,
-    SettingsError,
-    Vector,
-    read_toml,
-    require_between,
-    require_one_of,
-)
+from softneck.core import FileFormatError, ReprMixin, SettingsError, Vector, read_toml, require_between, require_one_of
 from softneck.runtime import Port
 
 from ._presets import PRESETS, SENSORS

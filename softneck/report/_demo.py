@@ -14,17 +14,7 @@ from softneck.core import OutputFileError, SettingsError, write_text
 from softneck.cosim import Result
 from softneck.identification import INFINITE, Model
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.plots import (
-    Chart,
-    Section,
-    Table,
-    cell,
-    loop_chart,
-    page,
-    recording_chart,
-    validation_chart,
-    write_page,
-)
+from softneck.plots import Chart, Section, Table, cell, loop_chart, page, recording_chart, validation_chart, write_page
 from softneck.signals import write_recording
 
 from ._demo_steps import (

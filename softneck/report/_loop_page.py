@@ -11,17 +11,7 @@ import numpy as np
 
 from softneck.core import METRICS, metric_of, to_si
 from softneck.cosim import Result
-from softneck.plots import (
-    Chart,
-    Level,
-    Script,
-    Section,
-    Table,
-    cell,
-    in_display_unit,
-    loop_chart,
-    page,
-)
+from softneck.plots import Chart, Level, Script, Section, Table, cell, in_display_unit, loop_chart, page
 
 # Positions of the slider; longer runs skip rows.
 _MAX_FRAMES = 1_500

@@ -32,15 +32,7 @@ from softneck.core import (
     settings_text,
     silent,
 )
-from softneck.cosim import (
-    Result,
-    find_python,
-    is_loop_file,
-    load_loop,
-    read_runs,
-    read_study_description,
-    simulate,
-)
+from softneck.cosim import Result, find_python, is_loop_file, load_loop, read_runs, read_study_description, simulate
 from softneck.identification import INFINITE, Rules, bandwidth_of, judge, judged_parts
 from softneck.plots import Section, Table, cell, loop_chart, page, recording_chart, validation_chart
 from softneck.robot import ROBOT_FILE

@@ -4,22 +4,14 @@ import numpy as np
 
 
 def step(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
+    arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, inputs: np.ndarray, outputs: np.ndarray
 ) -> None:
     """Placeholder: a bundle has the kind's own `step` instead."""
     raise NotImplementedError
 
 
 def run_steps(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
+    arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, inputs: np.ndarray, outputs: np.ndarray
 ) -> None:
     """Step once for each row of `inputs` (time, n_in); the outputs go to `outputs` (time, n_out)."""
     for k in range(inputs.shape[0]):

@@ -24,12 +24,7 @@ def member_initialise(
 
 
 def member_step(
-    arrays: object,
-    member: int,
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
+    arrays: object, member: int, parameters: np.ndarray, state: np.ndarray, inputs: np.ndarray, outputs: np.ndarray
 ) -> None:
     """Advance a member by one sample."""
     raise NotImplementedError

@@ -23,14 +23,7 @@ from softneck.loop import BlockPart, Loop, LoopResult, MotorFault, RobotReferenc
 from softneck.robot import Robot
 from softneck.runtime import Block
 
-from ._experiments import (
-    DELAY_SCAN,
-    GAIN_SCAN,
-    Experiment,
-    LoopUnderTest,
-    bisect,
-    scale_loop_gain,
-)
+from ._experiments import DELAY_SCAN, GAIN_SCAN, Experiment, LoopUnderTest, bisect, scale_loop_gain
 from ._neck_loops import (
     AroundMiddle,
     SimulationModel,

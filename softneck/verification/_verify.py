@@ -144,10 +144,7 @@ class Verification(ReprMixin):
             "controller_kind": self.controller.block.kind,
             "units": [robot.motors.unit, robot.outputs.unit],
             "observer": self.observer,
-            "plants": {
-                "count": len(evidence.plants),
-                "sources": [_source_facts(neck) for neck in self.necks],
-            },
+            "plants": {"count": len(evidence.plants), "sources": [_source_facts(neck) for neck in self.necks]},
             "virtual_neck_loops": len(evidence.necks),
             "foreign_plants": evidence.foreign,
             **validity(evidence, self.tested),

@@ -7,16 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from softneck.core import SettingsError
-from softneck.loop import (
-    BlockPart,
-    Loop,
-    Part,
-    fault_field,
-    fault_keys,
-    reference_field,
-    reference_keys,
-    same_quantity,
-)
+from softneck.loop import BlockPart, Loop, Part, fault_field, fault_keys, reference_field, reference_keys, same_quantity
 from softneck.robot import Robot
 
 from ..parts._fmu_part import FmuPart

@@ -16,14 +16,7 @@ from softneck.runtime import load_functions
 from ..plants._coupled import grid_response
 from ..plants._uncertain import StepAndLoad, StepAndLoadResult, judge
 from ._controller import AxisController, ReferenceFilter
-from ._margins import (
-    Evaluate,
-    LoopMargins,
-    margins_of_loops,
-    polynomials_at,
-    sensitivities_of_loops,
-    sensitivity_of,
-)
+from ._margins import Evaluate, LoopMargins, margins_of_loops, polynomials_at, sensitivities_of_loops, sensitivity_of
 
 # Lowest frequency on which a neck's loop is judged [rad/s]; loops of slower robots are from where their times are.
 LOWEST = 0.05

@@ -11,14 +11,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from softneck.core import (
-    Matrix,
-    SettingsError,
-    require_between,
-    require_finite,
-    require_one_of,
-    require_positive,
-)
+from softneck.core import Matrix, SettingsError, require_between, require_finite, require_one_of, require_positive
 from softneck.estimation import ORDERS, AxisPlant
 from softneck.loop.default_limits import DESIGN_OVERSHOOT_IN_LIMITS_PCT
 from softneck.robot import Robot, Scaling, find_robot

@@ -158,11 +158,7 @@ def close_loop(
     Ap, Bp, Cp = realise(plants, extra_delay)
     top = np.hstack([Ap + Bp @ D[:, m:] @ Cp, Bp @ C])
     bottom = np.hstack([B[:, m:] @ Cp, A])
-    return (
-        np.vstack([top, bottom]),
-        np.vstack([Bp @ D[:, :m], B[:, :m]]),
-        np.hstack([Cp, np.zeros((m, A.shape[0]))]),
-    )
+    return (np.vstack([top, bottom]), np.vstack([Bp @ D[:, :m], B[:, :m]]), np.hstack([Cp, np.zeros((m, A.shape[0]))]))
 
 
 def radius(parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: AnyAxes, extra_delay: int) -> float:

@@ -73,8 +73,7 @@ class MpcArrays(Arrays):
     rest = array(f"{_m}, entries", "x at rest under inputs of one")
     delays = array(_m, "d, dead times [samples]")
     disturbances = array(
-        f"1, columns = {_m} + 1 | {_m} + 2",
-        "zero for each output, the pole of its filter, where told the tautness",
+        f"1, columns = {_m} + 1 | {_m} + 2", "zero for each output, the pole of its filter, where told the tautness"
     )
     filters = array("references", "poles of the reference filters")
     T = array("references, motors", "of Eq. 9-11: motors to redefined inputs")

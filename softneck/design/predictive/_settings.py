@@ -8,15 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from softneck.core import (
-    Matrix,
-    ReprMixin,
-    SettingsError,
-    Vector,
-    require_between,
-    require_finite,
-    require_one_of,
-)
+from softneck.core import Matrix, ReprMixin, SettingsError, Vector, require_between, require_finite, require_one_of
 from softneck.estimation import ORDERS
 from softneck.robot import Robot, find_robot
 

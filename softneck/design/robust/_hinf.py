@@ -94,9 +94,7 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, above: float = _GAMMA_FACTOR) -> S
     K = control.StateSpace(*parts, 0)
     closed: Any = image.lft(K)
     return Synthesis(
-        controller=to_discrete(K, dt) if dt else K,
-        gamma=gamma,
-        achieved=_verify_norm(closed, above * gamma),
+        controller=to_discrete(K, dt) if dt else K, gamma=gamma, achieved=_verify_norm(closed, above * gamma)
     )
 
 

@@ -108,12 +108,7 @@ def identify(
     quiet = noise < _NOISY
     scales = _scales(seen, file, expected, types or {}, order, quiet=quiet)
     late = float(np.median(lags)) - expected.lag if lags and quiet and expected is not None else math.nan
-    findings = [
-        *_still_motors(moves, count),
-        *_signs(seen, file),
-        *_scale_findings(scales, file, seen),
-        *turned,
-    ]
+    findings = [*_still_motors(moves, count), *_signs(seen, file), *_scale_findings(scales, file, seen), *turned]
     findings += [Finding(
         "unclear", f"its tilt for a turn is known to {100.0 * one.error:.0f} % only: gear, current and lateness were "
         "not judged", "Does its tendon slide, is the sensor loose? Put it right and commission it anew.", (j,),

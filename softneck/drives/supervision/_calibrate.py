@@ -32,12 +32,7 @@ _HIGH_QUANTILE = 0.95
 
 
 def calibrate(
-    motions: Sequence[Motion],
-    *,
-    cycle: float,
-    sample_cycles: int,
-    slack: float,
-    known_bias: float = _KNOWN_BIAS,
+    motions: Sequence[Motion], *, cycle: float, sample_cycles: int, slack: float, known_bias: float = _KNOWN_BIAS
 ) -> Baseline:
     """Return the baseline of undisturbed motion.
 

@@ -73,11 +73,7 @@ class MotorFeatures:
         """Start with an empty memory."""
         self._cycle, self._seen = cycle, 0
         self._functions: Any = load_functions(RUNTIME)
-        self.past = (
-            np.zeros((_SET_POINTS, motors)),
-            np.zeros((5, motors)),
-            np.zeros((_TENSION_CYCLES + 1, motors)),
-        )
+        self.past = (np.zeros((_SET_POINTS, motors)), np.zeros((5, motors)), np.zeros((_TENSION_CYCLES + 1, motors)))
         self.x = np.zeros((_TENSION_CYCLES + 1, motors, motors + _OWN))
         self._edges = np.array(EDGES)
 

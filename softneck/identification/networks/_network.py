@@ -127,11 +127,7 @@ class Network:
 
     @one_blas_thread
     def fit(
-        self,
-        recordings: Recording | list[Recording],
-        *,
-        hold_out: Recording | None = None,
-        progress: Progress = silent,
+        self, recordings: Recording | list[Recording], *, hold_out: Recording | None = None, progress: Progress = silent
     ) -> Model:
         """Train a network for each output, two at a time; Ctrl-C keeps the best so far.
 

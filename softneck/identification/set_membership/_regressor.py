@@ -337,12 +337,7 @@ def residual_lags(recording: Recording, paced: bool) -> tuple[int, ...]:
 
 
 def residual_rows(
-    recording: Recording,
-    base: Model,
-    table: Matrix,
-    axis: int,
-    *,
-    measured: bool = False,
+    recording: Recording, base: Model, table: Matrix, axis: int, *, measured: bool = False
 ) -> tuple[Matrix, Vector]:
     """Return regressors (n, N) and y(k) less the base's simulation (N,), no row of a run before the base settled.
 

@@ -306,10 +306,7 @@ def input_names(robot: Robot) -> tuple[tuple[str, ...], Matrix]:
     if robot.directions.names:
         return robot.directions.names, robot.redefinition()[0]
     rest = np.linalg.svd(weights)[2][weights.shape[0] :]
-    return (
-        *robot.input_names,
-        *(f"cocontraction_{k + 1}" for k in range(rest.shape[0])),
-    ), np.vstack([weights, rest])
+    return (*robot.input_names, *(f"cocontraction_{k + 1}" for k in range(rest.shape[0]))), np.vstack([weights, rest])
 
 
 def _run(run: Recording, transform: Matrix, source: str) -> _Run:

@@ -136,12 +136,7 @@ def windows(
 
 
 def fit_local(
-    search: SrivcFitOptions,
-    group: Sequence[Window],
-    axis: int,
-    *,
-    scope: str,
-    near: Continuous | None = None,
+    search: SrivcFitOptions, group: Sequence[Window], axis: int, *, scope: str, near: Continuous | None = None
 ) -> Local | None:
     """Fit one model to all windows of a group, each with its own start and offset; None if they are not informative.
 

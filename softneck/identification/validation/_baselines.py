@@ -162,8 +162,7 @@ def baselines(segments: Sequence[ScoredSegment], rows: Rows, horizons: Sequence[
             pairs = zip(rows.outputs_at(k).T, predicted.T, strict=True)
             held[name] = _by_axis(axes, [nrmse_fit(y, yhat) for y, yhat in pairs])
     return Baselines(
-        persistence=held,
-        best_linear={name: _by_axis(axes, fits) for name, fits in zip(names, bounds, strict=True)},
+        persistence=held, best_linear={name: _by_axis(axes, fits) for name, fits in zip(names, bounds, strict=True)}
     )
 
 

@@ -188,11 +188,7 @@ class Validation(ReprMixin):
             "rows_trained": self.rows_trained,
             "rows_by_horizon": self.rows_by_horizon,
             "measured_range": self.measured_range,
-            "fits": {
-                "persistence": self.persistence,
-                "model": self.fits,
-                "best_linear": self.best_linear,
-            },
+            "fits": {"persistence": self.persistence, "model": self.fits, "best_linear": self.best_linear},
             "intervals": self.intervals,
             "rmse_deg": self.rmse_deg,
             "worst_deg": self.worst_deg,

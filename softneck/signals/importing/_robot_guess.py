@@ -83,11 +83,7 @@ def is_of_another_robot(path: str | Path) -> bool:
 
 
 def guess_robot(
-    path: str | Path,
-    named: NamedColumns | None = None,
-    *,
-    robot: Robot | None = None,
-    sample_time: float | None = None,
+    path: str | Path, named: NamedColumns | None = None, *, robot: Robot | None = None, sample_time: float | None = None
 ) -> RobotGuess:
     """Propose the robot and the layout of a log; what is not named follows from titles, units and motion.
 

@@ -120,9 +120,7 @@ def _items(cell: object) -> list[float]:
         return []
 
 
-def _plain_numbers(
-    frame: pd.DataFrame,
-) -> tuple[pd.DataFrame, tuple[tuple[str | int, str], ...], list[str]]:
+def _plain_numbers(frame: pd.DataFrame) -> tuple[pd.DataFrame, tuple[tuple[str | int, str], ...], list[str]]:
     """Return a table whose cells `1.2 rad` and `1,234.5` are numbers, the units in cells, and lines."""
     import pandas as pd
 

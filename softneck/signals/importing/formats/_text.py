@@ -39,11 +39,7 @@ _OTHER_FORMATS = (
     (b"BM", "a BMP picture", _EXPORT_HINT),
     (b"RIFF", "a sound, film or picture", _EXPORT_HINT),
     (b"%PDF", "a PDF document", _EXPORT_HINT),
-    (
-        b"TDSm",
-        "a TDMS file of LabVIEW",
-        "export it as .lvm or CSV (in Python npTDMS reads it)",
-    ),
+    (b"TDSm", "a TDMS file of LabVIEW", "export it as .lvm or CSV (in Python npTDMS reads it)"),
     (b"\x1f\x8b", "compressed by gzip", "unpack it with gunzip"),
     (b"7z\xbc\xaf", "a 7z archive", "unpack it"),
     (b"SQLite format 3", "a SQLite database", "a ROS 2 bag of this kind becomes MCAP by `ros2 bag convert`"),
