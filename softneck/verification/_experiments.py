@@ -132,21 +132,16 @@ class Crossing:
     robot: Robot = _NECK
 
 
-def crossings(
-    loops: Sequence[LoopUnderTest], *, coarse: bool = False, overall: bool = False, progress: Progress = silent
-) -> list[Crossing]:
+def crossings(loops: Sequence[LoopUnderTest], *, overall: bool = False, progress: Progress = silent) -> list[Crossing]:
     """Return the crossings of every loop over axes, gain and delay, step size and posture.
 
     A scan ends at the crossing of an earlier one of the same plant, axes and kind, and then gives inf. `loops`: over
-    each plant. `coarse`: one posture, both axes at once, coarse gains, no bisection: the last value without
-    oscillation. `overall`: find only the smallest gain and delay margin of all loops: the last loop with all axes at
+    each plant. `overall`: find only the smallest gain and delay margin of all loops: the last loop with all axes at
     once, the hardest test, bounds the scans of all others, which take every other step. `progress`: called now and
     then.
     """
     kinds = ("gain_up", "gain_down", "delay")
-    groups = [
-        (loop, axes, what) for loop in loops for axes in (loop.axes[-1:] if coarse else loop.axes) for what in kinds
-    ]
+    groups = [(loop, axes, what) for loop in loops for axes in loop.axes for what in kinds]
     # The first run compiles the loop, once instead of in every thread.
     leaders = groups[:1]
     if overall:
@@ -158,7 +153,7 @@ def crossings(
 
     def group(job: tuple[LoopUnderTest, str, str]) -> list[Crossing]:
         nonlocal done
-        found = _scan_group(*job, coarse, least[job[2]])
+        found = _scan_group(*job, least[job[2]])
         done += 1
         progress(done / len(groups), f"{job[0].name}: {job[2].replace('_', ' ')} of {job[1]}")
         return found
@@ -171,12 +166,12 @@ def crossings(
     return first + [found for part in side_by_side([partial(group, job) for job in others]) for found in part]
 
 
-def _scan_group(loop: LoopUnderTest, axes: str, what: str, coarse: bool, least: float = math.inf) -> list[Crossing]:
+def _scan_group(loop: LoopUnderTest, axes: str, what: str, least: float) -> list[Crossing]:
     """Return the crossings of one kind; scans end at `least` or at an earlier crossing."""
     found: list[Crossing] = []
     sparse = math.isfinite(least)
     # A posture changes the gain of a plant, not whether a loop is conditionally stable.
-    postures = loop.postures()[:1] if coarse or what == "gain_down" else loop.postures()
+    postures = loop.postures()[:1] if what == "gain_down" else loop.postures()
     for lean, amplitude in product(postures, loop.kicks):
         posture = tuple(loop.size * angle for angle in lean)
         case = Experiment(loop, axes, what, amplitude, posture)
@@ -185,33 +180,33 @@ def _scan_group(loop: LoopUnderTest, axes: str, what: str, coarse: bool, least: 
             break  # no smaller value exists
         floor, value = case.floor(), none
         if case.comes_to_rest(floor):
-            value = _first_crossing(case, floor, least, coarse, sparse)
+            value = _first_crossing(case, floor, least, sparse)
         hunts = floor if _REPORTED_SHARE * amplitude < floor < math.inf else 0.0
         found.append(Crossing(loop.name, axes, what, amplitude, posture, value, hunts, loop.robot))
         least = min(least, value)
     return found
 
 
-def _first_crossing(case: Experiment, floor: float, least: float, coarse: bool, sparse: bool = False) -> float:
+def _first_crossing(case: Experiment, floor: float, least: float, sparse: bool) -> float:
     """Return the smallest scanned value with an oscillation, bisected; inf if there is none below `least`."""
     calm = 0.0 if case.what == "delay" else 1.0
-    for scanned in _scan_values(case, coarse, sparse):
+    for scanned in _scan_values(case, sparse):
         value = min(scanned, least)
         if case.oscillates(value, floor):
-            return calm if coarse else bisect(case, calm, value, floor)
+            return bisect(case, calm, value, floor)
         if value >= least:
             break
         calm = value
     return math.inf
 
 
-def _scan_values(case: Experiment, coarse: bool, sparse: bool) -> Iterator[float]:
+def _scan_values(case: Experiment, sparse: bool) -> Iterator[float]:
     if case.what == "delay":
         unit = case.loop.samples * case.sample_time
         yield from (samples * unit for samples in (DELAY_SCAN[1::2] if sparse else DELAY_SCAN))
     else:
         # Down to a quarter: a loop with an unstable plant fails before, others never.
-        yield from _COARSE_GAINS[:4] if case.what == "gain_down" else _COARSE_GAINS if coarse or sparse else GAIN_SCAN
+        yield from _COARSE_GAINS[:4] if case.what == "gain_down" else _COARSE_GAINS if sparse else GAIN_SCAN
 
 
 def bisect(case: Experiment, calm: float, loud: float, floor: float) -> float:

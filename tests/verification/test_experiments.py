@@ -91,7 +91,7 @@ def test_only_the_axis_that_is_raised_counts_and_both_at_once_are_found_through_
 def test_an_unstable_loop_has_no_margin_and_an_overflow_is_an_oscillation() -> None:
     plants = all_plants([source_of_family(family(), "f")], 12, 0)
     slow = plants.take([0]).later(20)
-    found = _scan_group(over(slow, 0), "pitch", "gain_up", False)
+    found = _scan_group(over(slow, 0), "pitch", "gain_up", math.inf)
     assert min(item.value for item in found) == 1.0
 
 
@@ -104,7 +104,7 @@ def test_the_first_crossing_is_found_where_stability_is_not_monotone(monkeypatch
         return (1.0, 1.0) if loud else (1.0, 0.0)
 
     monkeypatch.setattr(Experiment, "_windows", windows)
-    found = _scan_group(over(all_plants([source_of_family(family(), "f")], 2, 0), 0), "pitch", "gain_up", False)
+    found = _scan_group(over(all_plants([source_of_family(family(), "f")], 2, 0), 0), "pitch", "gain_up", math.inf)
     assert found[0].value == pytest.approx(1.5, rel=0.005)
     # Later cases look no further than the least so far.
     assert all(item.value == pytest.approx(1.5, rel=0.005) or math.isinf(item.value) for item in found)
@@ -136,24 +136,16 @@ def neck_loop(block: Block) -> LoopUnderTest:
 
 @pytest.mark.nightly
 @pytest.mark.slow
-def test_the_virtual_neck_stands_less_than_its_linear_model_and_coarse_is_quick() -> None:
+def test_the_margins_of_the_virtual_neck_take_seconds() -> None:
     block = VirtualNeck(NeckParameters.paper().without_noise()).block()
     loop = neck_loop(block)
-    crossings([loop], coarse=True)
-    begin = time.process_time()
-    coarse = crossings([loop], coarse=True)
-    # Issue 29: under 3 s of processor time, to tune with.
-    assert time.process_time() - begin < 3.0
-    up = min(item.value for item in coarse if item.what == "gain_up")
+    crossings([loop])
     begin = time.process_time()
     full = crossings([loop])
     # Issue 29: under 20 s of processor time for one controller.
     assert time.process_time() - begin < 20.0
     fine = min(item.value for item in full if item.axes == "both" and item.what == "gain_up")
     assert 1.2 < fine < 20.0
-    # Coarse: the last of a ladder of sqrt(2) that was calm, in one posture.
-    assert up / math.sqrt(2.0) <= fine * 1.01
-    assert np.isfinite([item.value for item in coarse if item.what == "delay"]).any()
 
 
 def test_the_least_of_all_is_the_same_where_only_that_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:

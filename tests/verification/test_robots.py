@@ -214,7 +214,7 @@ def test_of_a_loop_that_does_not_answer_nothing_is_certified() -> None:
         name="m", plant=lambda: BlockPart(block), controller=controller.block(), compiled=False, robot=BELLOWS,
         size=0.01, noise=0.01, axes=BELLOWS.outputs.names,
     )  # fmt: skip
-    found = crossings([loop], coarse=True)
+    found = crossings([loop])
     assert [item.value for item in found] == [0.0 if item.what == "delay" else 1.0 for item in found]
 
 
