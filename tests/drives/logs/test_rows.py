@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softneck.drives.logs import _spool
-from softneck.drives.logs._rows import Rows, motion_at
-from softneck.drives.logs._spool import Spool
+from softneck.drives.logs import _rows
+from softneck.drives.logs._rows import Rows, Spool, motion_at
 from softneck.drives.running._pilot import RunLog
 from softneck.signals import NECK
 
@@ -35,13 +34,13 @@ def fed(cycles: int, every: int, folder: Path) -> tuple[Rows, np.ndarray, np.nda
     return rows, table[: len(first)], times, positions, first
 
 
-@pytest.mark.parametrize("block", [_spool._BLOCK, 10])
+@pytest.mark.parametrize("block", [_rows._BLOCK, 10])
 @pytest.mark.parametrize(("cycles", "every"), list(itertools.product([1, 2, 3, 4, 500], [1, 2, 5])))
 def test_rows_on_disk_are_those_in_memory(
     cycles: int, every: int, block: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_spool, "_BLOCK", block)
-    monkeypatch.setattr(_spool, "_ROWS_AT_ONCE", 7)
+    monkeypatch.setattr(_rows, "_BLOCK", block)
+    monkeypatch.setattr(_rows, "_ROWS_AT_ONCE", 7)
     rows, table, times, positions, first = fed(cycles, every, tmp_path)
     found = rows.finish()
     for one, other in zip(found, (table, *motion_at(times, positions, first)), strict=True):
@@ -70,7 +69,7 @@ class SmallDisk:
 def test_a_full_disk_loses_nothing_and_is_told_once(
     space: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_spool, "_BLOCK", 64)
+    monkeypatch.setattr(_rows, "_BLOCK", 64)
     spool = Spool(4, tmp_path)
     monkeypatch.setattr(spool, "_file", SmallDisk(spool._file, space))
     rows = np.random.default_rng(1).normal(size=(500, 4))
@@ -86,7 +85,7 @@ def test_a_disk_without_room_for_columns_gives_them_from_memory(
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(_spool, "_BLOCK", 64)
+    monkeypatch.setattr(_rows, "_BLOCK", 64)
     monkeypatch.setattr(os, "posix_fallocate", full)
     rows = np.random.default_rng(2).normal(size=(500, 4))
     spool = Spool(4, tmp_path)
@@ -98,7 +97,7 @@ def test_a_disk_without_room_for_columns_gives_them_from_memory(
 def test_without_disk_and_memory_the_first_rows_are_kept_and_the_rest_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_spool, "_MOST_HELD", 70)
+    monkeypatch.setattr(_rows, "_MOST_HELD", 70)
     rows = Rows(3, 2, tmp_path / "gone")
     for k in range(20):
         rows.take(float(k), (0.0, 0.0))
@@ -129,4 +128,4 @@ def test_memory_does_not_grow_with_the_duration(tmp_path: Path) -> None:
     grown(10, tmp_path)  # what is imported and kept for ever
     # Two blocks of 64 kB more or less; 6,000 rows of 200 B in memory would be 1.2 MB.
     short, long = grown(2_000, tmp_path), grown(8_000, tmp_path)
-    assert long < short + 2 * 8 * _spool._BLOCK
+    assert long < short + 2 * 8 * _rows._BLOCK
