@@ -47,7 +47,7 @@ from softneck.fmu import build_fmu
 from softneck.plant import NeckParameters
 
 from ..data import slow_but
-from .bench import Bench
+from .bench import Bench, tear
 from .conftest import STEP, Project
 
 ROTATION = 'kind = "rotation"\ninclination_deg = 12.0\nfrequency_hz = 0.2'
@@ -166,7 +166,7 @@ def test_zero_tensions_every_tendon_and_marks_the_drives(profile: str) -> None:
 @pytest.mark.slow
 def test_a_torn_tendon_is_found_while_zeroing() -> None:
     file, link = default_drives(), virtual()
-    link.neck.tear(2)
+    tear(link.neck, 2)
     report = preflight(link, file)
     with pytest.raises(CheckFailedError, match=r"node 2: the tendon of this motor did not get tight within 10 s"):
         zero(link, file, lambda: link.newest, guarding=report.guarding)
@@ -212,7 +212,7 @@ def test_no_zero_is_taken_for_one_where_homing_did_not_end(what: str, latency: f
         for column in (SERVO_ZERO, SERVO_POSITION, SERVO_DEMAND, SERVO_TARGET):
             axis.motion[column] += late
         if what == "turns on":  # the tendon slips off, and the motor runs where it was asked to pull
-            link.neck.tear(3)
+            tear(link.neck, 3)
 
     axis._mode_bits = homed
     wrong = {"not attained": lambda word: word & ~0x1000, "tells an error": lambda word: word | 0x2000}.get(what)

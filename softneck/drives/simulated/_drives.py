@@ -107,10 +107,6 @@ class SimulatedDrives(abc.ABC):
         """Set disturbances by name."""
 
     @abc.abstractmethod
-    def tear(self, tendon: int) -> None:
-        """Make a tendon slack; the first has number 1."""
-
-    @abc.abstractmethod
     def move(self) -> None:
         """Advance drives and plant by one bus cycle."""
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from softneck.core import SettingsError, Vector
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.plant._neck_runtime import VirtualNeckArrays, VirtualNeckState
 from softneck.robot import Robot
 from softneck.runtime import load_functions, sized_name
 
@@ -37,7 +36,6 @@ class SimulatedNeck(SimulatedDrives):
         self._disturbances = tuple(port.name for port in block.inputs[motors:])
         start = block.initial_state()
         self._arrays, self._q, self._x = block.arrays, start.parameters, start.values.copy()
-        self._free = VirtualNeckState.parts(VirtualNeckArrays(block.arrays))["free"]
         self.outputs: Vector = start.outputs.copy()
         self.disturbance: Vector = np.zeros(len(self._disturbances))
         # A drive with another gear than the neck's pulls with that gear; the inertia stays the neck's.
@@ -58,10 +56,6 @@ class SimulatedNeck(SimulatedDrives):
             if name not in self._disturbances:
                 raise SettingsError(f"`{name}` is not a disturbance; the neck has {', '.join(self._disturbances)}.")
             self.disturbance[self._disturbances.index(name)] = value
-
-    def tear(self, tendon: int) -> None:
-        """Make a tendon slack, one metre too long; the first has number 1."""
-        self._x[self._free][tendon - 1] += 1.0
 
     def move(self) -> None:
         """Advance drives and neck by one bus cycle."""

@@ -101,10 +101,6 @@ class SimulatedSprings(SimulatedDrives):
             if value:
                 raise SettingsError(f"`{name}`: simulated drives that turn springs take no load; leave it out.")
 
-    def tear(self, tendon: int) -> None:
-        """Make a tendon slack, so that it no longer pulls at its winch; the first has number 1."""
-        self._table[tendon - 1, SPRING_REST : SPRING_STIFFNESS + 1] = 0.0
-
     def move(self) -> None:
         """Advance by one bus cycle."""
         self._functions.springs_ticks(

@@ -17,6 +17,8 @@ from softneck.drives.running._timing import Ask
 from softneck.plant import NeckParameters
 from softneck.signals import prepare, signal
 
+from ..bench import tear
+
 PSI = (0.0, 2.0 * math.pi / 3.0, 4.0 * math.pi / 3.0)
 PAPER = NeckParameters.paper()
 # What the virtual neck tilts for one radian is a few percent off the watch's gain (Eq. 31 is a fit), and noise and
@@ -116,7 +118,7 @@ def test_record_and_run_name_a_reversed_motor_on_the_way_in(motor: int, preset: 
 def test_a_slack_tendon_does_not_move_the_neck() -> None:
     file = default_drives()
     link = link_to(file)
-    link.neck.tear(1)
+    tear(link.neck, 1)
     found = jog(1, Session(file=file, link=link), tendon_angles=PSI)
     assert found.verdict == "no movement"
     with pytest.raises(CheckFailedError, match=r"no movement. Is its tendon attached and tight"):
