@@ -124,7 +124,6 @@ class Panel(ReprMixin):
         y_range: initial limits of y; None fits the curves.
         least_span: the curves are fitted to no smaller range of y, so that rounding does not fill a panel.
         equal: one unit has the same length on both axes, as for a path over pitch and roll.
-        ticks: names at x = 0, 1, ... instead of numbers.
     """
 
     curves: Sequence[Curve]
@@ -138,7 +137,6 @@ class Panel(ReprMixin):
     log_x: bool = False
     log_y: bool = False
     equal: bool = False
-    ticks: Sequence[str] = ()
 
     @property
     def limits(self) -> tuple[float, float] | None:
@@ -230,8 +228,6 @@ def _draw(ax: Axes, panel: Panel) -> None:
         ax.set_aspect("equal", adjustable="datalim")
     if panel.limits is not None:
         ax.set_ylim(*panel.limits)
-    if panel.ticks:
-        ax.set_xticks(range(len(panel.ticks)), panel.ticks, rotation=30, ha="right")
     ax.set_ylabel(panel.y_label)
     ax.set_title(panel.title, fontsize="medium", loc="left")
     if panel.legend and any(item.label for item in (*panel.curves, *panel.levels)):

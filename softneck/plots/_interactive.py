@@ -133,9 +133,6 @@ def _plot(panel: Panel, chart: Chart, number: int) -> Plot:
         # The panel below has the same axis. On a logarithmic axis Bokeh fails at size 0 (NaN box).
         plot.xaxis.major_label_text_font_size = "1px" if panel.log_x else "0px"
         plot.xaxis.major_label_text_alpha = 0.0
-    if panel.ticks:
-        plot.xaxis.ticker = list(range(len(panel.ticks)))
-        plot.xaxis.major_label_overrides = dict(enumerate(panel.ticks))
         plot.xaxis.major_label_orientation = _TICK_SLANT
         plot.height = (plot.height or 0) + _TICK_NAMES_PX
     if panel.title:
