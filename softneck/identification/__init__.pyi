@@ -45,7 +45,6 @@ from .models._linear_systems import weights_of as weights_of
 from .models._model import embed_model as embed_model
 from .models._model import embedded_model as embedded_model
 from .models._validity import find_farthest_motor as find_farthest_motor
-from .models._validity import low_pass_motors as low_pass_motors
 from .models._validity import with_tolerance as with_tolerance
 from .selection._auto import COLD as COLD
 from .selection._auto import EXAM as EXAM

@@ -21,7 +21,7 @@ from softneck.core import (
     silent,
     to_si,
 )
-from softneck.identification import find_farthest_motor, low_pass_motors
+from softneck.identification import find_farthest_motor
 from softneck.loop import BlockPart, LoopResult, Part, StepCallback, System, check_limits, metrics, run_loop
 from softneck.loop import Loop as Loop  # re-exported by the subpackage
 from softneck.robot import Robot
@@ -328,33 +328,14 @@ def _validity_cause(result: LoopResult, plant: Part, row: int) -> str:
         return beyond
     robot, unit = result.robot, result.robot.motors.unit
     motors = np.column_stack([result[name] for name in robot.motor_positions])
-    if not isinstance(plant, BlockPart):
-        return _nearest_end(plant, low_pass_motors(motors[: row + 1])[-1], robot)
+    if not isinstance(plant, BlockPart):  # an FMU tells its ranges alone
+        return "its motors have a combination of values that was not in training"
     motor, stays, value, times = find_farthest_motor(plant.block, motors[: row + 1])
     what = "has been held around" if stays else "is at"
     place = f"`{robot.motor_positions[motor]}` {what} {value / to_si(unit)[0]:.3g} {unit}"
     if times <= 1.0:
         return f"{place}, a combination with the others that was not in training"
     return f"{place}, {times:.1f} times as far from its mean as most of the training"
-
-
-def _nearest_end(plant: Part, places: Vector, robot: Robot) -> str:
-    """Return the motor, held at `places` (motors,), nearest to an end of its training range in the FMU `plant`."""
-    unit, worst, found = robot.motors.unit, -1.0, "its motors have a combination of values that was not in training"
-    ports = {port.name: port for port in plant.inputs}
-    for name, motor, place in zip(robot.set_points, robot.motor_positions, places, strict=True):
-        low, high = (ports[name].minimum, ports[name].maximum) if name in ports else (None, None)
-        if low is None or high is None or high <= low:
-            continue
-        share = abs(2.0 * place - low - high) / (high - low)
-        if share > worst:
-            worst = share
-            place, low, high = (value / to_si(unit)[0] for value in (place, low, high))
-            found = (
-                f"`{motor}` has been held around {place:.3g} {unit}, which is within the {low:.3g} to {high:.3g} "
-                f"{unit} of its training, but it was not held there, or not with these values of the others"
-            )
-    return found
 
 
 def _outside_training(result: LoopResult, plant: Part, row: int) -> str:
