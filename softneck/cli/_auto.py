@@ -52,7 +52,8 @@ def identify_auto(
         choice = identification.choose_kind(
             parts, name=str(recordings[-1]), train=train, seed=seed or 0, progress=report
         )
-    others = _others(choice)
+    found = identification.best_others(choice.ranking, choice.chosen)
+    others = {sort: replace(choice, chosen=one) for sort, one in found.items() if one.model is not None}
     saved = {path: choice, **{beside[sort]: other for sort, other in others.items()}}
     models: list[identification.Model] = []
     for file, taken in saved.items():
@@ -106,12 +107,6 @@ def _model(choice: identification.Choice) -> identification.Model:
     return choice.chosen.model
 
 
-def _others(choice: identification.Choice) -> dict[str, identification.Choice]:
-    """Return the choices of the best kinds of other sorts, by their sort."""
-    found = identification.best_others(choice.ranking, choice.chosen)
-    return {sort: replace(choice, chosen=one) for sort, one in found.items() if one.model is not None}
-
-
 def _title(robot: Robot) -> str:
     return _TABLE_TITLE.format(names=" and ".join(robot.outputs.names))
 
@@ -121,7 +116,6 @@ def _rows(choice: identification.Choice) -> list[list[str]]:
 
 
 def _row(one: identification.KindTrial, chosen: bool) -> list[str]:
-
     if one.model is None:
         return [one.kind, *["-"] * 5, f"{one.seconds:.1f} s", "-", f"not identified: {one.failure}"[:76]]
     scores, error = one.scores, one.errors.get(one.worst)

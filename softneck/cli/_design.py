@@ -138,8 +138,6 @@ def _fit(
     observer: Any, data: tuple[Path, ...], robot: str | None, named: set[str]
 ) -> tuple[estimation.FittedObserver, list[str]]:
     """Fit the observer to the recordings; return it and the lines to print."""
-    # Imported here: `softneck --help` must not wait for scipy's optimisers.
-
     recordings = [signals.read_recording(path, robot=robot) for path in data]
     found = estimation.fit_observer(observer, recordings, named)
     unit = observer.robot.outputs.display_unit

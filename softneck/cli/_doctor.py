@@ -79,7 +79,6 @@ def _fmu_platform() -> dict[str, str]:
 
 
 def _compiled_fmus() -> dict[str, str]:
-
     try:
         built, how = fmu.platforms_built()
     except FileFormatError as error:

@@ -201,7 +201,9 @@ def command(
     known_robot = given or stored is not None
     propose = named is not None or robot_out is not None
     propose |= layout_file is None and not known_robot and signals.is_of_another_robot(log)
-    if propose or (layout_file is None and not _can_guess(whose)):
+    # A log without titles can be guessed for a robot with the neck's channels.
+    of_neck = (whose.set_points, whose.outputs.names) == (signals.SET_POINTS, signals.OUTPUTS)
+    if propose or (layout_file is None and not of_neck):
         proposed, imported, facts = _of_robot(job, whose, robot_out, known=known_robot, propose=propose)
         layout = proposed.layout
     elif layout_file is None:
@@ -221,11 +223,6 @@ def _output_of_neck(log: Path, named: signals.NamedColumns | None) -> str | None
     if output not in signals.OUTPUTS or signals.has_column(log, output) or signals.is_of_another_robot(log):
         return None
     return output
-
-
-def _can_guess(robot: Robot) -> bool:
-    """Return whether a log without titles can be guessed for this robot: it has the neck's channels."""
-    return (robot.set_points, robot.outputs.names) == (signals.SET_POINTS, signals.OUTPUTS)
 
 
 def _read_recorded(log: Path, robot: str | None) -> tuple[signals.ImportResult, dict[str, Any]]:

@@ -62,7 +62,6 @@ def describe_log(file: Path) -> dict[str, Any]:
 
 
 def _stops(name: str) -> bool:
-
     rule = drives.RULES.get(name)
     return rule is not None and rule.reaction in (drives.Reaction.STOP, drives.Reaction.RETREAT)
 

@@ -35,7 +35,7 @@ def new(folder: Path, loop_file: Path | None, force: bool, as_json: bool) -> Non
 
     It is of the virtual neck; `softneck start LOG` makes the one of your own log.
     """
-    project = _project_name(folder)
+    project = re.sub(r"[^A-Za-z0-9]+", "-", folder.resolve().name).strip("-").lower() or "neck"
     texts = _texts(project) if loop_file is None else _of_loop(loop_file, folder, project)
     held = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
     if held and not force:
@@ -76,11 +76,6 @@ def _texts(project: str) -> dict[str, str]:
             text = text.replace(word, value)
         found[".gitignore" if name == "gitignore" else name] = text
     return found
-
-
-def _project_name(folder: Path) -> str:
-    name = re.sub(r"[^A-Za-z0-9]+", "-", folder.resolve().name).strip("-").lower()
-    return name or "neck"
 
 
 @click.command("report", epilog="Example: softneck report my_neck -o my_neck.html")

@@ -198,7 +198,6 @@ def record_next(
 
 
 def _load_known(source: Path, robot: str | None) -> identification.Known:
-
     model = load_for_robot(source, robot=robot)
     if not isinstance(model, identification.Model):
         raise SettingsError(f"{source}: is no model; give one of kind `guarded`.")

@@ -104,7 +104,6 @@ def _text_for_folder(source: Path, folder: Path) -> str:
 
 
 def _check_files(robot: Robot) -> None:
-
     folder = robot.folder or Path()
     if robot.neck is not None:
         # The file is there and holds a neck, and the robot is one that tendons on winches bend.

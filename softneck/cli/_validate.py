@@ -97,7 +97,6 @@ def _print(results: list[identification.Validation]) -> None:
 
 
 def _horizons(text: str) -> tuple[int | str, ...]:
-
     horizons: list[int | str] = []
     for word in text.split(","):
         if word.strip() == identification.INFINITE:

@@ -151,7 +151,6 @@ def _tried(folder: Path, families: list[str]) -> list[str]:
 
 
 def _print(path: Path, found: verification.Verification, folder: Path) -> None:
-
     table = verification.verdict_table(found)
     print_table(str(path), table.head, table.rows)
     for part in found.evidence.drawn:

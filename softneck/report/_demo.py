@@ -234,14 +234,17 @@ _TITLES = {
 
 def _sections(demo: Demo) -> list[Section]:
     first, *others = demo.loops
+    found = [[name, line] for name, model in demo.models.items() for line in model.summary().splitlines()[1:]]
+    models = Table("Models and their findings", ["model", "finding"], found, text=2)
+    recordings = {"identification": demo.experiments.identification, **demo.experiments.judged}
     return [
         _overview(demo, first),
         _fits(demo),
         *(_validation_section(data, demo) for data in demo.experiments.judged if data != _FIRST_TEST),
         *(Section(f"Closed loop: {to_words(name)}", charts=[_loop(name, demo.loops[name])]) for name in others),
         _design_section(demo.designed),
-        _model_section(demo.models),
-        _experiment_section(demo.experiments),
+        Section("Identified models", tables=[models]),
+        Section("Experiment", charts=[recording_chart(item, _TITLES[name]) for name, item in recordings.items()]),
     ]
 
 
@@ -272,18 +275,6 @@ def _fits(demo: Demo) -> Section:
     return Section("Models", charts=_validation_section(_FIRST_TEST, demo).charts[:1], method=method, tables=[table])
 
 
-def _experiment_section(experiments: Experiments) -> Section:
-    recordings = {"identification": experiments.identification, **experiments.judged}
-    return Section(
-        "Experiment", charts=[recording_chart(recording, _TITLES[name]) for name, recording in recordings.items()]
-    )
-
-
-def _model_section(models: Mapping[str, Model]) -> Section:
-    rows = [[name, line] for name, model in models.items() for line in model.summary().splitlines()[1:]]
-    return Section("Identified models", tables=[Table("Models and their findings", ["model", "finding"], rows, text=2)])
-
-
 def _validation_section(data: str, demo: Demo) -> Section:
     results = {name: demo.judged[name, data].free for name in demo.models}
     first = next(iter(results.values()))
@@ -300,9 +291,9 @@ def _validation_section(data: str, demo: Demo) -> Section:
 def _design_section(designed: DemoDesign) -> Section:
     rows = [["controller", line] for line in designed.controller.summary().splitlines()]
     rows += [["observer", line] for line in designed.observer.summary().splitlines()]
-    to_words = ["Both were designed on the identified linear model and simulated below with the virtual neck."]
+    text = ["Both were designed on the identified linear model and simulated below with the virtual neck."]
     return Section(
-        "Design", text=to_words, tables=[Table("Controller and Kalman filter", ["part", "finding"], rows, text=2)]
+        "Design", text=text, tables=[Table("Controller and Kalman filter", ["part", "finding"], rows, text=2)]
     )
 
 

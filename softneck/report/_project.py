@@ -129,11 +129,6 @@ def _is_worst(entry: Path) -> bool:
     return stem != entry.name and entry.with_name(f"{stem}.certificate.json").is_file()
 
 
-def _is_front(entry: Path) -> bool:
-    """Return whether a table is the front of `softneck tune`, which its folder also holds as JSON."""
-    return entry.name == "pareto.csv" and entry.with_name("pareto.json").is_file()
-
-
 def _files(root: Path) -> Iterator[Path]:
     """Yield files sorted by name; of a study's folder only `study.json`."""
     entries = sorted(root.iterdir())
@@ -145,7 +140,8 @@ def _files(root: Path) -> Iterator[Path]:
             continue
         if entry.is_dir():
             yield from _files(entry)
-        elif entry.suffix.lower() in _READERS and not _is_front(entry):
+        # The front of `softneck tune` is in its folder as JSON too.
+        elif entry.suffix.lower() in _READERS and (entry.name != "pareto.csv" or not (root / "pareto.json").is_file()):
             yield entry
 
 
@@ -184,7 +180,7 @@ def _read_archive(project: Project, path: Path, name: str) -> None:
     header, _ = read_archive(path)
     role = {"family": project.families, "observer": project.observers, "controller": project.controllers}
     thing = load(path)
-    if header.get("kind") != "loop_state" and hasattr(thing, "summary"):
+    if hasattr(thing, "summary"):
         kind = str(header.get("kind"))
         role.get(KINDS[kind].role if kind in KINDS else "", project.models)[name] = thing
 

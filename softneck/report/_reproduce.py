@@ -86,7 +86,10 @@ def reproduce(settings: ReproduceSettings, *, tell: Tell) -> Reproduction:
     experiments = record_experiments(NeckParameters.paper(), duration=settings.duration, tell=tell)
     models = _models(experiments, settings, tell)
     others: dict[str, Verdicts] = {}
-    for name, neck in _other_necks(settings.other_necks).items():
+    rng, sampled = np.random.default_rng(_SPREAD_SEED), range(1, settings.other_necks - 1)
+    necks = {ROUGH: NeckParameters.rough(), "lab": NeckParameters.lab()}
+    necks |= {f"neck {number}": NeckParameters.paper().sample(rng) for number in sampled}
+    for name, neck in list(necks.items())[: settings.other_necks]:
 
         def tell_neck(text: str, name: str = name) -> Progress:
             return tell(f"{name}: {text}")
@@ -107,12 +110,6 @@ def _models(experiments: Experiments, settings: ReproduceSettings, tell: Tell) -
     }
     data = experiments.identification
     return {kind: estimator.fit(data, progress=tell(f"identify {kind}")) for kind, estimator in estimators.items()}
-
-
-def _other_necks(count: int) -> dict[str, NeckParameters]:
-    rng = np.random.default_rng(_SPREAD_SEED)
-    drawn = {f"neck {number + 1}": NeckParameters.paper().sample(rng) for number in range(max(count - 2, 0))}
-    return dict(list({ROUGH: NeckParameters.rough(), "lab": NeckParameters.lab(), **drawn}.items())[:count])
 
 
 Pair = tuple[float, float]

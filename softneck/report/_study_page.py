@@ -42,7 +42,9 @@ def study_sections(description: Mapping[str, Any], runs: pd.DataFrame) -> list[S
         if inputs := _numbers(runs, vary):
             sections.append(_influence(runs, inputs, objectives[0]))
     if any(failed):
-        sections.append(_failures(runs))
+        lost = [[str(row["run"]), str(row["error"])[:300]] for row in runs.to_dict("records") if row["error"]]
+        table = Table(f"{len(lost)} runs failed", ["run", "error"], lost[:20], text=2)
+        sections.append(Section("Failed runs", tables=[table]))
     return [*sections, _overview(description, runs, objectives)]
 
 
@@ -148,12 +150,6 @@ def _influence(runs: pd.DataFrame, inputs: dict[str, np.ndarray], metric: str) -
     chart = influence_chart(shown, (metric, y), broken, f"Influences on {metric}")
     table = Table(f"Rank correlation with {metric} (Spearman)", ["key", "correlation"], rows)
     return Section("Influence", tables=[table], charts=[chart])
-
-
-def _failures(runs: pd.DataFrame) -> Section:
-    failed = [row for row in runs.to_dict("records") if row["error"]]
-    rows = [[str(row["run"]), str(row["error"])[:300]] for row in failed[:20]]
-    return Section("Failed runs", tables=[Table(f"{len(failed)} runs failed", ["run", "error"], rows, text=2)])
 
 
 def _split(runs: pd.DataFrame, vary: Mapping[str, Any]) -> list[tuple[str, pd.DataFrame]]:

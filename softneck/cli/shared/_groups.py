@@ -88,8 +88,6 @@ def kinds_complete(role: str, *more: str) -> Callable[[click.Context, click.Para
     """Return a completion function for the kinds of `role` and `more`."""
 
     def complete(_ctx: click.Context, _param: click.Parameter, begun: str) -> list[str]:
-        # Here, for it imports NumPy: the command line sets the number of its threads first.
-
         return [name for name in (*core.kinds_of(role), *more) if name.startswith(begun)]
 
     return complete

@@ -161,7 +161,6 @@ def _robot(source: str) -> Step:
 
 
 def _import(log: str, recording: str, options: Options) -> Step:
-
     layout, robot = (Path(recording).with_suffix(ending) for ending in (".layout.toml", ".robot.toml"))
     whose = "robot.toml" if options.robot is not None else robot.as_posix() if robot.is_file() else None
     page, settings = f"build/import/{Path(recording).stem}.html", f"{log} of {options.robot}"
@@ -245,7 +244,6 @@ def nonlinear_model() -> str | None:
 
 
 def _controller(options: Options) -> Iterator[Step]:
-
     family = Path(FAMILY).is_file()
     linear, nonlinear = FAMILY if family else linear_model(), nonlinear_model()
     plant = nonlinear or linear_model()

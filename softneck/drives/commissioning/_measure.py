@@ -10,7 +10,6 @@ from typing import Any
 
 from softneck.core import CheckFailedError
 from softneck.plant import NeckParameters
-from softneck.robot import Robot
 
 from ..bus._file import DrivesFile
 from ..bus._link import CanLink, VirtualLink
@@ -95,19 +94,17 @@ def cautious(file: DrivesFile, guards: Guards) -> DrivesFile:
     """Return `file` with the limits of the moves: low current, slow ramps, no limits on unknown positions."""
     current = file.zero.current if guards.current is None else guards.current
     drives = tuple(replace(entry, current_limit=min(current, entry.current_limit)) for entry in file.drives)
-    far = 1.1 * guards.travel + 1.0
+    far, robot = 1.1 * guards.travel + 1.0, file.robot
+    if robot is not None:
+        robot = replace(robot, motors=replace(robot.motors, setpoint_min=None, setpoint_max=None, rate_limit=None))
     return replace(
         file,
         drives=drives,
         limits=replace(file.limits, position=far, speed=2.0, slack_unwind=20.0),
         watch=replace(file.watch, **_OPEN),
         ramps=replace(file.ramps, speed=0.3, settle=0.2, tolerance=0.2),
-        robot=None if file.robot is None else _without_limits(file.robot),
+        robot=robot,
     )
-
-
-def _without_limits(robot: Robot) -> Robot:
-    return replace(robot, motors=replace(robot.motors, setpoint_min=None, setpoint_max=None, rate_limit=None))
 
 
 def _from_here(

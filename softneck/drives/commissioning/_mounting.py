@@ -67,14 +67,8 @@ def explain(directions: Matrix, tendons: Matrix) -> list[Mounting]:
              for axes in _axes(tendons.shape[0]) for order in _orders(directions, tendons, axes, known)]  # fmt: skip
     best = min(one.off for one in found)
     alike = [one for one in found if one.off < best + _ALIKE]
-    fewest = min(one.mistakes for one in alike)
-    return sorted(
-        (one for one in alike if one.mistakes == fewest), key=lambda one: (one.axes != _straight(one), one.off)
-    )
-
-
-def _straight(one: Mounting) -> Axes:
-    return tuple((k, 1.0) for k in range(len(one.axes)))
+    fewest, straight = min(one.mistakes for one in alike), tuple((k, 1.0) for k in range(tendons.shape[0]))
+    return sorted((one for one in alike if one.mistakes == fewest), key=lambda one: (one.axes != straight, one.off))
 
 
 def _axes(outputs: int) -> Iterator[Axes]:

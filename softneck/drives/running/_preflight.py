@@ -425,7 +425,8 @@ def _guarding(objects: Objects, wanted: str, rows: Report) -> tuple[str, frozens
     if possible:
         return possible[0], has
     kinds = GUARDED_BY if wanted == "auto" else (wanted,)
-    told = " and ".join(f"no {kind} guarding: it lacks {_object_list(lacks[kind])}" for kind in kinds)
+    named = {kind: ", ".join(f"{index:04X}h" for index in lacks[kind]) for kind in kinds}
+    told = " and ".join(f"no {kind} guarding: it lacks {named[kind]}" for kind in kinds)
     rows.add(objects.node, "guarding", told, False, "A drive must notice by itself that its master is gone.")
     return "", has
 

@@ -111,7 +111,8 @@ class Axis:
             self.values[key] += self.node
         if self.profile.rated_current:
             self.values[(0x6075, 0)] = round(1000.0 * self.profile.rated_current)
-        self._default_limits()
+        if (0x207F, 0) in self.values:
+            self.values[(0x207F, 0)] = 32760  # the peak current: no limit unless set
         self.state, self.fault, self.homed = SWITCH_ON_DISABLED, 0, False
         self._word = self._stop_then = 0
         self._attained = self._acknowledged = False
@@ -122,11 +123,6 @@ class Axis:
         m[servo.SERVO_ZERO] -= m[servo.SERVO_POSITION]
         m[servo.SERVO_POSITION] = 0.0
         self._configure()
-
-    def _default_limits(self) -> None:
-        key = (0x207F, 0)
-        if key in self.values:
-            self.values[key] = 32760  # the peak current: no limit unless set
 
     @property
     def _units_per_count(self) -> float:

@@ -184,7 +184,9 @@ class SimulatedDrive:
             if self.nmt != _STOPPED and not told & _PDO_DISABLED:
                 self._out.append(CanFrame(told & 0x7FF, struct.pack("<HB5x", code, register)))
         if self.nmt == _OPERATIONAL:
-            self._events()
+            for pdo in self._transmit_pdos:  # the event-driven ones with changed data
+                if pdo.kind >= 254 and (data := self._pack(pdo)) != pdo.sent:
+                    self._send(pdo, data)
         frames, self._out = self._out, []
         return frames
 
@@ -194,12 +196,6 @@ class SimulatedDrive:
         self._errors = [code, *self._errors][:2] if v[(0x1003, 0)] else [code]
         v[(0x1003, 0)] = len(self._errors)
         v |= {(0x1003, place): error for place, error in enumerate(self._errors, start=1)}
-
-    def _events(self) -> None:
-        """Send the event-driven PDOs with changed data."""
-        for pdo in self._transmit_pdos:
-            if pdo.kind >= 254 and (data := self._pack(pdo)) != pdo.sent:
-                self._send(pdo, data)
 
     def _watch_times(self) -> None:
         v = self.axis.values

@@ -201,12 +201,8 @@ def _families(draft: Draft, role: str, own: set[Column]) -> list[Family]:
         if title.role == role and title.motor is not None and column not in own:
             groups[title.rank, title.family].setdefault(title.motor, column)
     found = [(rank, group) for (rank, _), group in groups.items() if sorted(group) in ([1, 2, 3], [0, 1, 2])]
-    return [_by_number(group) for _, group in sorted(found, key=lambda entry: entry[0])]
-
-
-def _by_number(group: dict[int, Column]) -> Family:
-    first, second, third = (group[number] for number in sorted(group))
-    return first, second, third
+    ranked = [[group[number] for number in sorted(group)] for _, group in sorted(found, key=lambda entry: entry[0])]
+    return [(first, second, third) for first, second, third in ranked]
 
 
 def _take(draft: Draft, channels: tuple[str, ...], family: Family, more: str = "") -> None:

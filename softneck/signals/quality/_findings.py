@@ -83,7 +83,10 @@ class Quality(ReprMixin):
     def findings(self) -> tuple[Finding, ...]:
         """Return all findings, warnings first; a topic without a fault gives one "ok"."""
         found = [finding for channel in self.channels.values() for finding in _channel(channel, self)]
-        found += [*_excitation(self), *_directions(self), *_ranges(self), *_correlation(self), *_modes(self)]
+        found += [*_excitation(self), *_directions(self), *_ranges(self), *_correlation(self)]
+        for name, mode in self.modes.items():
+            said = f"is lightly damped: the motors make it {mode}."
+            found.append(Finding("note", "damping", name, said, "Identify it with two poles or more."))
         topics = {finding.topic for finding in found if finding.severity != "ok"}
         moved, bandwidth = ", ".join(self.spectrum.inputs), self.spectrum.bandwidth
         clean = _CLEAN | {"excitation": f"{moved} move up to the bandwidth of {bandwidth:.3g} rad/s."}
@@ -318,12 +321,6 @@ def _correlation(quality: Quality) -> Iterator[Finding]:
             message = f"motors {names[0]} and {names[1]} move together (correlation {r:.2f})."
             advice = "Their effects cannot be separated well; move them independently."
             yield Finding("warning" if abs(r) > _COLLINEAR else "note", "correlation", "", message, advice)
-
-
-def _modes(quality: Quality) -> Iterator[Finding]:
-    for name, mode in quality.modes.items():
-        advice = "Identify it with two poles or more."
-        yield Finding("note", "damping", name, f"is lightly damped: the motors make it {mode}.", advice)
 
 
 def _places(segments: tuple[Segment, ...]) -> str:

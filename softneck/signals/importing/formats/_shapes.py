@@ -46,7 +46,9 @@ def reshaped(frame: pd.DataFrame) -> Reshaped:
         time, name, value = names
         count = frame[name].nunique()
         lines.append(f"file: long form: {count} signals by the names in column '{name}', pivoted")
-        frame = _pivoted(frame, time, name, value)
+        order = list(dict.fromkeys(frame[name]))
+        table = frame.pivot_table(index=time, columns=name, values=value, sort=True, aggfunc="first")[order]
+        frame = table.reset_index().rename_axis(columns=None)
     frame, listed = _without_lists(frame)
     lines += listed
     frame, units, cleaned = _plain_numbers(frame)
@@ -79,12 +81,6 @@ def _long_form(frame: pd.DataFrame) -> tuple[str, str, str] | None:
     rising = [name for name in numbers if all((np.diff(part[name]) > 0).all() for _, part in within)]
     values = [name for name in numbers if name not in rising]
     return (rising[0], words[0], values[0]) if len(rising) == 1 and len(values) == 1 else None
-
-
-def _pivoted(frame: pd.DataFrame, time: str, name: str, value: str) -> pd.DataFrame:
-    order = list(dict.fromkeys(frame[name]))
-    table = frame.pivot_table(index=time, columns=name, values=value, sort=True, aggfunc="first")[order]
-    return table.reset_index().rename_axis(columns=None)
 
 
 def _without_lists(frame: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
