@@ -317,8 +317,7 @@ def require_file(path: str | Path, hint: str = "") -> None:
 def read_toml(path: str | Path, hint: str = "") -> dict[str, Any]:
     """Return the content of a TOML file; `hint` says what to give instead of a file that is missing.
 
-    Raises:
-        FileFormatError: no such file, or no TOML.
+    Raises FileFormatError: no such file, or no TOML.
     """
     require_file(path, hint)
     try:

@@ -169,8 +169,7 @@ def find_kind(name: str, role: str) -> Kind:
 def make_settings(settings_class: type, values: Mapping[str, Any]) -> Any:
     """Return `settings_class(**values)`.
 
-    Raises:
-        SettingsError: a key that the class does not have, or a value of the wrong type.
+    Raises SettingsError: a key that the class does not have, or a value of the wrong type.
     """
     fields = {field.name for field in dataclasses.fields(settings_class)}
     unknown = sorted(set(values) - fields)

@@ -46,10 +46,8 @@ def row_actions(
     Sequential, as on the hardware: the plant is read, then observer and controller step, each with the outputs of the
     earlier ones, then the plant. Jacobi: all parts step with the bus at t_k, and their outputs are read at t_k+1.
 
-    `ratios` are the sample times of the parts in rows; `closed` loops have a reference.
-
-    Raises:
-        SettingsError: an algebraic loop.
+    `ratios` are the sample times of the parts in rows; `closed` loops have a reference. Raises SettingsError: an
+    algebraic loop.
     """
     numbers = {name: i for i, name in enumerate(parts)}
 

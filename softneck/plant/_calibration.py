@@ -84,8 +84,7 @@ class Calibration(ReprMixin):
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write a neck file.
 
-        Raises:
-            CheckFailedError: it follows less than 85 % of what it was not fitted to: it is not the user's neck.
+        Raises CheckFailedError: it follows less than 85 % of what it was not fitted to: it is not the user's neck.
         """
         if not self.worst >= LEAST_FIT:
             fits = ", ".join(f"{pitch:.1f}/{roll:.1f}" for pitch, roll in self.fits)

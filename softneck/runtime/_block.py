@@ -173,8 +173,7 @@ class SteppedMixin:
     def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
         """Return the next state and the outputs valid now; inputs and outputs as in `block()`.
 
-        Raises:
-            DataError: wrong number of inputs, or one that is not finite.
+        Raises DataError: wrong number of inputs, or one that is not finite.
         """
         return self.block().step(state, inputs)
 

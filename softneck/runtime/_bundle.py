@@ -203,8 +203,7 @@ def own_arrays(outer: str) -> int:
 def layout_of(module: str, base: type) -> Any:
     """Return the subclass of `base` that annotates an argument of a module's `step`, or else of its first function.
 
-    Raises:
-        SettingsError: no argument has such an annotation.
+    Raises SettingsError: no argument has such an annotation.
     """
     module = module.partition("@")[0]
     functions = [node for node in _tree(module).body if isinstance(node, ast.FunctionDef)]

@@ -388,8 +388,7 @@ def step_function(block: Block, parameters: Vector, inputs: int) -> Any:
         parameters: numbers, in the block's order.
         inputs: number of inputs that are symbols u; the others are missing (NaN).
 
-    Raises:
-        SettingsError: the text has a construct that symbols do not allow; the message names function and line.
+    Raises SettingsError: the text has a construct that symbols do not allow; the message names function and line.
     """
     import casadi as ca
 

@@ -74,8 +74,7 @@ def load_functions(module: str, *, compiled: bool = True) -> Any:
 def load_tangent(module: str, *, compiled: bool = True) -> Callable[..., None]:
     """Return `step_tangent` of runtime module `module`; see `_tangent`.
 
-    Raises:
-        TangentError: its step has no derivative.
+    Raises TangentError: its step has no derivative.
     """
     with _LOADING:
         return _tangent(module, compiled)

@@ -60,8 +60,7 @@ _ACTIVE_ARGUMENTS = (("state", 1), ("inputs", 1), ("outputs", 1))
 def with_tangent(text: str) -> str:
     """Return the bundle `text` with `step_tangent` and the functions it needs.
 
-    Raises:
-        TangentError: the step has no derivative, or the text has a construct without a rule.
+    Raises TangentError: the step has no derivative, or the text has a construct without a rule.
     """
     derivation = _Derivation(Program(text))
     derivation.rows_of_step()

@@ -20,8 +20,7 @@ _NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "e
 def robot_of(given: str | Path | Robot | None, beside: Path | None) -> Robot | None:
     """Return the robot that is given, or whose file is beside or above the drives file; None: the neck, not spoken of.
 
-    Raises:
-        SettingsError: no such robot, or one that these drives cannot move.
+    Raises SettingsError: no such robot, or one that these drives cannot move.
     """
     if given is None and (beside is None or robot_file_of(beside) is None):
         return None
@@ -49,8 +48,7 @@ def count_word(count: int) -> str:
 def require_table(table: Mapping[str, Any], robot: Robot | None) -> Mapping[str, Any]:
     """Return the table of a drives file, completed by the robot's values.
 
-    Raises:
-        SettingsError: both say it and differ, or none says what the watch needs of a robot that is no neck.
+    Raises SettingsError: both say it and differ, or none says what the watch needs of a robot that is no neck.
     """
     if robot is None:
         return table

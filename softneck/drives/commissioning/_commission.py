@@ -198,8 +198,7 @@ def _robot(file: DrivesFile, found: Identified, expected: Expected | None) -> Ro
 def require_folder(folder: Path, *, force: bool) -> None:
     """Raise where the files of a commissioning could not be written; before anything moves.
 
-    Raises:
-        OutputFileError: a file exists and not `force`, or the folder cannot be written.
+    Raises OutputFileError: a file exists and not `force`, or the folder cannot be written.
     """
     for name in (DRIVES, ROBOT):
         refuse_existing(folder / name, force=force)

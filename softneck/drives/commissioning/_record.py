@@ -85,8 +85,7 @@ def drive_limits(
 ) -> SetPointLimits:
     """Return limits for a signal within those of the drives file; those of the file where none are given.
 
-    Raises:
-        SettingsError: beyond the drives file.
+    Raises SettingsError: beyond the drives file.
     """
     # One number for all motors here; what each of them may do beyond its own range is clipped by `Experiment`.
     farthest = max(max(-low, high) for low, high, _ in file.ranges)

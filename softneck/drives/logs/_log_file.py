@@ -73,8 +73,7 @@ class LoggedRun:
     def settings(self) -> MasterSettings:
         """Return the settings of the run's master.
 
-        Raises:
-            FileFormatError: damaged settings, or those of another version.
+        Raises FileFormatError: damaged settings, or those of another version.
         """
         try:
             table = dict(self.facts["settings"])
@@ -118,8 +117,7 @@ class LoggedRun:
     def recording(self) -> Recording:
         """Return the run as a recording, the same as `softneck drives run -o` or `record -o` writes.
 
-        Raises:
-            DataError: the controller did not run.
+        Raises DataError: the controller did not run.
         """
         if len(self.rows) < 2:
             raise DataError(f"{self.path}: the controller did not run, so there is nothing to identify from.")

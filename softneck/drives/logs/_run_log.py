@@ -183,8 +183,7 @@ class RunLogger:
     def close(self) -> None:
         """Write the remaining entries and rename the file.
 
-        Raises:
-            OutputFileError: the log is not complete; the message has the reason.
+        Raises OutputFileError: the log is not complete; the message has the reason.
         """
         if not self._thread.is_alive() and self._stream.closed:
             return

@@ -41,8 +41,7 @@ class Node:
 def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
     """Return the tree for the runtime name `outer(inner:11,other:13)` and its arrays.
 
-    Raises:
-        SettingsError: a runtime that is not in the table, or arrays of other ranks than declared.
+    Raises SettingsError: a runtime that is not in the table, or arrays of other ranks than declared.
     """
     outer, _, inner = runtime.partition("(")
     pairs = [part.rpartition(":") for part in split_members(inner[:-1])] if inner else []
