@@ -57,7 +57,6 @@ from ._requirements import bounds_of as bounds_of
 from ._requirements import check_number as check_number
 from ._requirements import expand_metrics as expand_metrics
 from ._requirements import read_file as read_file
-from ._requirements import tune_only_metrics as tune_only_metrics
 from ._steps import run_steps as run_steps
 from ._verify import Verdict as Verdict
 from ._verify import sources_of as sources_of

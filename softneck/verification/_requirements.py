@@ -36,11 +36,6 @@ def select_for_verify(own: Mapping[str, Any]) -> dict[str, Any]:
     return found | {"require": {metric: entry for metric, entry in kept.items() if not metric.startswith("track.")}}
 
 
-def tune_only_metrics(own: Mapping[str, Any]) -> list[str]:
-    """Return the required metrics that only `tune` checks."""
-    return [metric for metric, entry in own.get("require", {}).items() if metric.startswith("track.") and entry]
-
-
 def apply_safety_margin(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any], dict[str, float]]:
     """Subtract the safety margins of [reserve]; return the requirements and the margins used."""
     if not isinstance(reserve, Mapping):
@@ -376,8 +371,6 @@ def _refuse_contradictions(bounds: tuple[Requirement, ...], robot: Robot) -> Non
         rise, settling = low.get(f"{group}.rise_s", 0.0), high.get(f"{group}.settling_s", math.inf)
         if rise > settling:
             raise SettingsError(f"`{group}` cannot rise in {rise:g} s or more and settle within {settling:g} s.")
-    for axis in robot.outputs.names:
-        _refuse_margins(axis, low, high)
 
 
 # Smallest and largest possible values, at which a bound always holds.
@@ -411,19 +404,3 @@ def _refuse_weak(bounds: tuple[Requirement, ...], tables: Mapping[str, Mapping[s
                 f"`[{group}] duration_s` = {tables[group]['duration_s']:g} is shorter than the settling time that "
                 f"`{item.metric}` allows ({item.limit:g} s); lengthen it."
             )
-
-
-def _refuse_margins(axis: str, low: Mapping[str, float], high: Mapping[str, float]) -> None:
-    """Refuse contradictory margins: the gain margin is at least Ms/(Ms - 1), |S - T| at least 2 Ms - 1."""
-    gain, disk = high.get(f"{axis}.gain_margin", math.inf), low.get(f"{axis}.disk_margin", 0.0)
-    largest, least = high.get(f"{axis}.sensitivity", math.inf), low.get(f"{axis}.sensitivity", 1.0)
-    if 1.0 < largest < math.inf and gain < largest / (largest - 1.0):
-        raise SettingsError(
-            f"`{axis}.sensitivity` <= {largest:g} gives a gain margin of at least {largest / (largest - 1.0):.3g}; "
-            f"`gain_margin` <= {gain:g} contradicts it."
-        )
-    if disk > 2.0 / (2.0 * least - 1.0):
-        raise SettingsError(
-            f"`{axis}.sensitivity` >= {least:g} leaves a disk margin of at most {2.0 / (2.0 * least - 1.0):.3g}; "
-            f"`disk_margin` >= {disk:g} contradicts it."
-        )

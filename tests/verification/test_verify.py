@@ -319,10 +319,6 @@ def test_bad_input_is_told_in_words(files: dict[str, Path]) -> None:
           for tight, wide in permutations(('"axes.sensitivity" = { max = 1.5 }',
                                            '"roll.sensitivity" = { min = 2.0, max = 3.0 }'))),
         ('version = 1\n[require]\n"step.rise_s" = { min = 3.0 }', "cannot rise in 3 s or more and settle within 2 s"),
-        (
-            'version = 1\n[require]\n"axes.sensitivity" = { max = 1.5 }\n"axes.gain_margin" = { max = 2.5 }',
-            "contradicts",
-        ),
     ],
 )  # fmt: skip
 def test_requirements_that_cannot_be_meant_are_refused(tmp_path: Path, text: str, match: str) -> None:
