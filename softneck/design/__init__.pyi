@@ -5,7 +5,6 @@ from .linear._fopi import FopiSettings as FopiSettings
 from .linear._fopi import fopi as fopi
 from .linear._lqg import LqgSettings as LqgSettings
 from .linear._margins import Margins as Margins
-from .linear._margins import loop_margins as loop_margins
 from .linear._pi import PiSettings as PiSettings
 from .linear._pid import PidSettings as PidSettings
 from .linear._ports import ControllerLimits as ControllerLimits

@@ -13,9 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softneck.core import SettingsError
-from softneck.design import Margins, PiSettings, loop_margins, margins_of_loops, uncertain_plant
+from softneck.design import Margins, PiSettings, margins_of_loops, uncertain_plant
 from softneck.design.linear._margins import frequency_grid, sensitivities_of_loops
 from softneck.estimation import LinearNeck
+
+from .loops import loop_margins
 
 
 def response(L: Any, w: np.ndarray) -> np.ndarray:

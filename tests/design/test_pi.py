@@ -13,7 +13,7 @@ import pytest
 from scipy.io import loadmat
 
 from softneck.core import FileFormatError, SettingsError, Vector, load, read_archive, write_archive
-from softneck.design import LinearController, PiSettings, loop_margins
+from softneck.design import LinearController, PiSettings
 from softneck.design.linear._controller import AxisController, pi_axis
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.loop import BlockPart, Loop, LoopResult, StepReference, metrics, run_loop
@@ -21,6 +21,7 @@ from softneck.runtime import Port
 from softneck.signals import redefine
 
 from ..oracles.bake_off import exact, neck_within
+from .loops import loop_margins
 
 TS = 0.02
 POLE = math.exp(-5.293 * TS)

@@ -13,7 +13,7 @@ import pytest
 
 from softneck.core import DataError, SettingsError
 from softneck.cosim import load_loop, simulate
-from softneck.design import design_controller, loop_margins
+from softneck.design import design_controller
 from softneck.loop import BlockPart
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
@@ -27,6 +27,8 @@ from softneck.verification._steps import StepTest, run_steps
 from softneck.verification._verify import sources_of
 from tests.data import slow_but
 from tests.design.test_robots import BELLOWS, LEARNED, SLOW, plant
+
+from ..design.loops import loop_margins
 
 FEW: dict[str, Any] = {"sampling": {"plants": 12, "search_generations": 0}, "sim": {"necks": 0}}
 NONE = {"gain": 0.0, "pole": 0.0, "delay": 0.0}
