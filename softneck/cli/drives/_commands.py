@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import click
 
 from softneck import cosim, drives, signals
-from softneck.core import SettingsError, refuse_existing
+from softneck.core import SettingsError, refuse_existing, require_between
+from softneck.signals import signal_names, write_recording
 
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._groups import NearGroup
 from ..shared._options import common_options, output_option, target, trust_option
 from ._closing import closing
 from ._commission import commission_command
-from ._record import record_command
 from ._target import (
     Asked,
-    acting_files,
+    drives_of,
     drives_options,
+    moving,
     open_link,
     opened_log,
     require_log,
@@ -28,6 +30,9 @@ from ._target import (
     sensor_or_reason,
     target_of,
 )
+
+# From rest and out to it [s]: Eq. 22 begins at up to 1.9 rad, which a winch turns in half a second at the least.
+_RAMP_S = 2.0
 
 
 @click.group(
@@ -117,7 +122,8 @@ def run_command(
     if certified is not None:
         again = drives.require_same_again(deployed.loop, certified[1])
         note(f"{certified[1].path}: {again:g} of {deployed.loop.duration:g} s run again on the loop's plant: the same")
-    files = acting_files(setup, loop_file, controller, chosen.path)
+    files: dict[str, str | Path] = {role: path for role, (path, _) in setup.files.items()}
+    files |= {"loop": loop_file, "controller": controller, **drives_of(chosen.path)}
     sensor: Any = None if chosen.simulated else sensor_of(chosen.file)
     with contextlib.ExitStack() as last, contextlib.ExitStack() as stack:
         link = None if chosen.simulated else cast("drives.CanLink", stack.enter_context(open_link(chosen, moves=True)))
@@ -189,5 +195,78 @@ def _states(states: dict[int, str], what: str, *, as_json: bool) -> None:
         print_table(what, ["node", "state"], [[str(node), state] for node, state in states.items()])
 
 
+@command.command(
+    "record",
+    help="Record SIGNAL on the drives: an identification experiment, ramped in and out.\n\n"
+    "Signals: "
+    + ", ".join(signal_names())
+    + ", or a recording whose set-points are played. The drives must be zeroed. If a fault ends it early, what was "
+    "recorded until then is written, and the exit code is 1; Ctrl-C ramps to rest, keeps the data, and exits with 130.",
+    epilog="Example: softneck drives record eq22 -o eq22.csv --drives drives.toml --bus socketcan:can0 --arm",
+)
+@click.argument("signal_name", metavar="SIGNAL")
+@output_option("recording", "REC", required=True)
+@click.option("--duration", type=float, metavar="S", help="Length in seconds. [default: the signal's own]")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 200), default=0, show_default=True, help="Seed of the signal.")
+@click.option("--max-position", type=float, metavar="RAD", help="Clip set-points to +-RAD. [default: drives file]")
+@click.option(
+    "--cocontraction", type=float, default=0.0, show_default=True, metavar="RAD",
+    help="Played around this common position of all motors, which keeps tendons taut.",
+)  # fmt: skip
+@click.option("--payload", type=float, default=0.0, metavar="KG", help="Payload on the platform of --simulated.")
+@drives_options("override", "pace", "log")
+@common_options("force")
+def record_command(
+    asked: Asked, signal_name: str, output: Path, duration: float | None, seed: int, max_position: float | None,
+    cocontraction: float, payload: float,
+    force: bool, as_json: bool,
+) -> None:  # fmt: skip
+    """Record SIGNAL on the drives."""
+    signals.recording_suffix(output)
+    refuse_existing(output, force=force)
+    require_log(asked.log, force=force)
+    require_between("--payload", payload, 0.0, 1.0, "kg")
+    chosen = asked.target()
+    moved, limits = chosen.file.robot, drives.drive_limits(chosen.file, position=max_position)
+    experiment = drives.Experiment(
+        signal=signal_name, limits=limits, duration=duration, seed=seed, ramp=_RAMP_S,
+        cocontraction=cocontraction, robot=moved,
+        ranges=() if moved is None else chosen.file.ranges,
+    )  # fmt: skip
+    prepared = experiment.prepare_runs()
+    files = {"signal": signal_name} if Path(signal_name).is_file() else {}
+    with moving(asked, chosen, "record", force=force, homed=True, seed=seed, **files) as (session, end):
+        if isinstance(session.link, drives.VirtualLink):
+            session.link.neck.set(payload=payload)
+        with progress("record", quiet=as_json) as tell:
+            recorded = drives.record_signal(
+                [excitation for excitation, _ in prepared],
+                replace(session, facts={"record": experiment.facts()}),
+                report=lambda done: tell(done, signal_name),
+            )
+        for text in recorded.notes:
+            note(text)
+        recording, where = recorded.recording, None
+        if recording is not None:
+            where = end.write(output, lambda path: write_recording(path, recording, force=force))
+        facts: dict[str, Any] = {"signal": signal_name, "runs": len(prepared), "changes": prepared[0][1].as_dict()}
+        _print_record(where, recorded, facts, str(prepared[0][1]), as_json=as_json)
+        end.conclude(recorded.ended.master.supervisor.fault, recorded.require)
+
+
+def _print_record(
+    path: Path | None, recorded: drives.ExperimentResult, facts: dict[str, Any], changes: str, *, as_json: bool
+) -> None:
+    if as_json:
+        print_json({"recording": path and str(path), **facts, **recorded.table()})
+        return
+    if recorded.recording is None:
+        note("nothing was recorded")
+        return
+    rows = f"{recorded.rows} of {recorded.planned} rows of {facts['signal']}"
+    click.echo(f"{path or 'no recording'}: {rows}; set-points: {changes}")
+    for name, count in recorded.ended.master.counts.items():
+        click.echo(f"{name}: {count}")
+
+
 command.add_command(commission_command)
-command.add_command(record_command)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from softneck import cosim, plant
+from softneck import plant
 from softneck.core import OutputFileError, SettingsError, SoftneckError, require_between
 from softneck.drives import HARMLESS, OVERRIDES
 
@@ -313,14 +313,6 @@ def _drop_empty(log: RunLogger, *, own: bool) -> None:
     if own and not log.described and log.path.is_file():
         log.path.unlink()
         note(f"log: {log.path} is removed: nothing moved")
-
-
-def acting_files(
-    setup: cosim.LoopSetup, loop_file: Path, controller: Path, drives_file: Path | None
-) -> Mapping[str, str | Path]:
-    """Return role -> path of all files that act in a run, for its log."""
-    files: dict[str, str | Path] = {role: path for role, (path, _) in setup.files.items()}
-    return {**files, "loop": loop_file, "controller": controller, **drives_of(drives_file)}
 
 
 def drives_of(drives_file: Path | None) -> Mapping[str, str | Path]:
