@@ -325,7 +325,7 @@ class _Kicked:
     repeats: ClassVar[bool] = True  # equal ones have equal samples: `run_loop` keeps them
 
     def __call__(self, time: float) -> tuple[float, ...]:
-        led = smooth_rise(time, self.slower * LEAD_IN_S)
+        led = smooth_rise(time / self.slower, LEAD_IN_S)
         on = float(time >= self.slower * REST_S)
         return *(
             led * there + on * away for there, away in zip(self.posture, self.kick, strict=True)

@@ -35,7 +35,7 @@ from softneck.verification._neck_loops import (
 )
 from softneck.verification._plants import all_plants, source_of_family
 from softneck.verification._steps import Steps
-from softneck.verification._structured import structured_singular_value
+from softneck.verification._structured import interconnection, structured_singular_value
 from softneck.verification._verify import unsupported_reason
 
 from ..data import ROOT
@@ -347,6 +347,20 @@ def test_mu_over_the_weight_of_axes_apart_is_the_largest_of_each(weight: float) 
     alone = axis_margins(measured(weight=weight), LAW, 0, source="f", name="pitch", extra=0, rolloff=-1.0)
     # 90 frequencies in two decades: 5 % apart, and the peak is flat; the other grid adds half its step.
     assert found[0].mu == pytest.approx(alone.mu, rel=0.03)
+
+
+def test_the_loop_of_mu_is_the_same_in_every_scale() -> None:
+    """Of measured plants and of those of a box: what the gain is divided by, the controller's is multiplied by."""
+    w = np.geomspace(0.5, 20.0, 30)
+    sources = on_data(weight=0.2), family()
+    for neck in (source_of_family(one, "f") for one in sources):
+        # 50 rad in an SI unit of the outputs, such as metres; only rounding is left.
+        (one, blocks), (other, same) = (interconnection(neck, LAW, w, (0, 1), 1, gain) for gain in (1.0, 50.0))
+        assert blocks == same
+        scaled = [kind for kind, _ in blocks]
+        for k in np.flatnonzero(np.array(scaled) > 0):
+            np.testing.assert_allclose(other[:, k, k], one[:, k, k], rtol=1e-9)
+        np.testing.assert_allclose(np.linalg.det(other), np.linalg.det(one), rtol=1e-9)
 
 
 @pytest.mark.slow

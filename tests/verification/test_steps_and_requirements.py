@@ -14,7 +14,7 @@ import control
 import numpy as np
 import pytest
 
-from softneck.core import DataError, FileFormatError, SettingsError
+from softneck.core import DataError, FileFormatError, SettingsError, silent
 from softneck.core._certificate import required_rows
 from softneck.design import grid_response
 from softneck.estimation import LinearNeck
@@ -29,7 +29,8 @@ from softneck.verification import (
     metric_title,
     read_requirements,
 )
-from softneck.verification._linear import LinearLaw, frequency_grid
+from softneck.verification._evidence import _linear_evidence
+from softneck.verification._linear import LinearLaw, controller_under_test, frequency_grid
 from softneck.verification._plants import (
     all_plants,
     join,
@@ -137,11 +138,12 @@ def test_a_bound_holds_at_its_limit_except_below() -> None:
     ("table", "key", "low", "high"),
     [
         ("uncertainty", "gain_pct", 0.0, 95.0), ("uncertainty", "pole_pct", 0.0, 95.0),
-        ("uncertainty", "delay_ms", 0.0, 1e9), ("sampling", "plants", 1, 100_000),
+        ("uncertainty", "delay_ms", 0.0, 1e9), ("uncertainty", "rolloff_db_per_decade", -1.0, 200.0),
+        ("sampling", "plants", 1, 100_000),
         ("sampling", "search_generations", 0, 10_000), ("sampling", "seed", 0, 2**31 - 2),
         ("step", "size_deg", 0.01, 45.0), ("step", "duration_s", 1e-3, 1e6), ("step", "noise_deg", 0.0, 10.0),
         ("step", "load_rad", -6.0, 6.0), ("sim", "necks", 0, 1000), ("sim", "spread_pct", 0.0, 50.0),
-        ("sim", "size_deg", 0.01, 45.0), ("sim", "duration_s", 1e-3, 1e6),
+        ("sim", "size_deg", 0.01, 45.0), ("sim", "duration_s", 1e-3, 1e6), ("sim", "taut_up_to_kg", 0.0, 5.0),
     ],
 )  # fmt: skip
 def test_numbers_of_the_tables_have_their_ranges(table: str, key: str, low: float, high: float) -> None:
@@ -386,6 +388,17 @@ def test_joined_plants_respond_as_each_alone() -> None:
     np.testing.assert_array_equal(both.cross, np.concatenate([one.cross, two.cross]))
     # One sample of delay more turns the phase by w Ts and changes no size.
     np.testing.assert_allclose(both.later(1).response(w), both.response(w) * np.exp(-1j * w * TS), rtol=1e-12)
+
+
+def test_steps_of_the_first_plants_are_theirs_whatever_directions_a_further_model_has() -> None:
+    controller = controller_under_test(pi(), order=None, observer=False)
+    asked = make_requirements({"sampling": {"plants": 1, "search_generations": 0}, "step": {"noise_deg": 0.0}})
+    one, other = sources_of({"one": linear_neck(), "other": linear_neck()}, asked)
+    turned = replace(other, weights=one.weights[::-1])
+    alone, both = (_linear_evidence(controller, necks, asked, silent, {}) for necks in ([one], [one, turned]))
+    first = both.stepped.source == 0
+    assert 0 < first.sum() < first.size
+    np.testing.assert_array_equal(both.steps.angles[:, first], alone.steps.angles)
 
 
 def test_frequencies_go_up_to_nyquist() -> None:
