@@ -19,15 +19,13 @@ from softneck.core import FileFormatError
 from .shared._console import print_json, print_table
 from .shared._options import common_options
 
-# Extra -> the module it brings, and what for.
-_EXTRAS = {"dask": ("distributed", "studies on a cluster")}
-
 
 @click.command("doctor", epilog="Example: softneck doctor --json")
 @common_options()
 def command(as_json: bool) -> None:
     """Check this machine: packages, compilers, FMU platforms, CAN, extras."""
-    checks = [_python(), *_packages(), _compiler(), _fmu_platform(), _compiled_fmus(), _can(), *_extras()]
+    python = _check("python", "ok", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
+    checks = [python, *_packages(), _compiler(), _fmu_platform(), _compiled_fmus(), _can(), *_extras()]
     bad = [check for check in checks if check["state"] == "missing"]
     if as_json:
         print_json({"checks": checks, "healthy": not bad})
@@ -39,10 +37,6 @@ def command(as_json: bool) -> None:
 
 def _check(name: str, state: str, detail: str) -> dict[str, str]:
     return {"name": name, "state": state, "detail": detail}
-
-
-def _python() -> dict[str, str]:
-    return _check("python", "ok", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
 
 
 def _requirements() -> list[str]:
@@ -99,9 +93,9 @@ def _can() -> dict[str, str]:
 
 
 def _extras() -> list[dict[str, str]]:
-    checks = [
-        _check(f"extra {name}", "ok" if importlib.util.find_spec(module) else "absent", what)
-        for name, (module, what) in _EXTRAS.items()
-    ]
+    dask = "ok" if importlib.util.find_spec("distributed") else "absent"
     jit = "off by NUMBA_DISABLE_JIT" if os.environ.get("NUMBA_DISABLE_JIT", "0") != "0" else "on"
-    return [*checks, _check("compiled runtimes", "ok" if jit == "on" else "absent", f"numba {jit}")]
+    return [
+        _check("extra dask", dask, "studies on a cluster"),
+        _check("compiled runtimes", "ok" if jit == "on" else "absent", f"numba {jit}"),
+    ]

@@ -141,7 +141,10 @@ def _page(family: identification.Family) -> str:
     gain, unit = family.robot.shown_gain
     sections = []
     for name, axis in family.axes.items():
-        chart = plots.cover_chart(family.frequency, *_cover(family, name), f"{name}: the weight over its samples")
+        s, (above, below) = 1j * family.frequency, axis.weight
+        weight = np.abs(np.polyval(above, s) / np.polyval(below, s))
+        title = f"{name}: the weight over its samples"
+        chart = plots.cover_chart(family.frequency, family.errors(name), weight, title)
         head = ["", f"static gain [{unit}]", "pole [1/s]", "dead time [ms]"]
         parts = {"least": axis.box[0], "largest": axis.box[1], "nominal": axis.nominal}
         rows = [[label, *_numbers(row, gain)] for label, row in parts.items()]
@@ -163,12 +166,6 @@ def _verdict(family: identification.Family, name: str, gain: float, unit: str) -
         f"{shown}: the weight covers every response measured from {band[0]:.2g} to {band[1]:.2g} rad/s; "
         f"nothing is known above. In them {span}."
     )
-
-
-def _cover(family: identification.Family, name: str) -> tuple[np.ndarray, np.ndarray]:
-    s = 1j * family.frequency
-    above, below = family.axes[name].weight
-    return family.errors(name), np.abs(np.polyval(above, s) / np.polyval(below, s))
 
 
 def _numbers(row: np.ndarray, gain: float) -> list[str]:

@@ -230,7 +230,10 @@ def study_command(
     study = cosim.load_study(study_file)
     folder = output if output is not None else Path("build") / "studies" / study_file.stem
     with progress(f"study of {len(study.points)} runs", quiet=as_json) as report:
-        runs = cosim.run_study(study, folder, workers=workers, force=_anew(study, folder, output, force), report=report)
+        # Under build/ another study is replaced.
+        other = output is None and (folder / cosim.STUDY_FILE).is_file()
+        anew = force or (other and cosim.read_study_description(folder).get("digest") != study.digest)
+        runs = cosim.run_study(study, folder, workers=workers, force=anew, report=report)
     plots.write_page(folder / "report.html", study_page(cosim.read_study_description(folder), runs), force=True)
     paths = cosim.write_worst(study, runs, folder / "worst", count=_WORST_RUNS)
     if as_json:
@@ -242,12 +245,6 @@ def study_command(
         note(f"{len(runs)} runs, {failed} failed; report: {folder / 'report.html'}")
     if all(failures(runs)):
         raise CheckFailedError(f"{study_file}: every run failed; the first said: {runs['error'].iloc[0]}")
-
-
-def _anew(study: cosim.Study, folder: Path, output: Path | None, force: bool) -> bool:
-    """Return whether an existing study may be replaced: under build/, or with --force."""
-    there = output is None and (folder / cosim.STUDY_FILE).is_file()
-    return force or (there and cosim.read_study_description(folder).get("digest") != study.digest)
 
 
 def _summary(runs: pd.DataFrame, folder: Path, objectives: tuple[str, ...], worst: list[Path]) -> dict[str, Any]:

@@ -33,14 +33,6 @@ _ADAPTED_ARRAYS = {"oe": ("a", "b", "A", "B", "offset"), "play": ("weights",), "
 ADAPTING = tuple(_ADAPTED_ARRAYS)
 
 
-def require_adapting(model: Model) -> None:
-    """Raise SettingsError for a kind that cannot adapt."""
-    if model.kind not in ADAPTING:
-        raise SettingsError(
-            f"a model of kind `{model.kind}` cannot adapt; {', '.join(ADAPTING)} can. Identify it again on new data."
-        )
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeParameters:
     """The numbers of one model as one vector; `places`: array and mask of the entries in it that are moved."""
@@ -320,7 +312,11 @@ class Adaptation:
     @one_blas_thread
     def of(self, model: Model, recording: Recording) -> Model:
         """Return the adapted model, or the old one if it is no worse; findings hold the reason under `adaptation`."""
-        require_adapting(model)
+        if model.kind not in ADAPTING:
+            raise SettingsError(
+                f"a model of kind `{model.kind}` cannot adapt; {', '.join(ADAPTING)} can. Identify it again on new "
+                "data."
+            )
         model.check(recording)
         window = _latest(recording, self.window or _scale_seconds(_WINDOW_S, model))
         if window is None:
@@ -332,17 +328,14 @@ class Adaptation:
         if min(known.sum(axis=0).min(), held.sum(axis=0).min()) < _LEAST_ROWS:
             why = "an output was measured in too few of its rows"
             return _keep_model(model, AdaptationResult(adapted=False, why=why, seconds=seconds))
-        motion = reference(model)
-        if not _has_motion(window.set_points, motion.set_points):
+        motion, why = reference(model), ""
+        if not (window.set_points.std(axis=0) > _LEAST_MOTION * motion.set_points.std(axis=0)).any():
             why = "the window hardly moves the neck, so that it teaches nothing"
-            return _keep_model(
-                model, AdaptationResult(adapted=False, why=why, seconds=seconds, rows=int(held.any(axis=1).sum()))
-            )
-        if missing := _missing_direction(model, window.set_points, motion.set_points):
+        elif missing := _missing_direction(model, window.set_points, motion.set_points):
             why = f"the window moves the robot along one direction; add motion of {missing}"
-            return _keep_model(
-                model, AdaptationResult(adapted=False, why=why, seconds=seconds, rows=int(held.any(axis=1).sum()))
-            )
+        if why:
+            rows = int(held.any(axis=1).sum())
+            return _keep_model(model, AdaptationResult(adapted=False, why=why, seconds=seconds, rows=rows))
         free = FreeParameters.of(model)
         problem = Problem(free, window, known, window.outputs, information(free, motion), self.strength)
         return _accept_if_better(model, window, problem, problem.solve(), held)
@@ -408,11 +401,6 @@ def _split(window: Recording, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     block = np.arange(len(window)) // max(round(seconds / window.sample_time), 1)
     held = (block % _HOLD_OUT_PERIOD == _HOLD_OUT_PERIOD - 1)[:, None]
     return there & ~held, there & held
-
-
-def _has_motion(window: Matrix, motion: Matrix) -> bool:
-    """Return whether a motor moves enough over the window, compared with the reference motion."""
-    return bool((window.std(axis=0) > _LEAST_MOTION * motion.std(axis=0)).any())
 
 
 def _missing_direction(model: Model, window: Matrix, motion: Matrix) -> str:

@@ -74,7 +74,9 @@ def record(
     names = [port.name for port in block.outputs]
     channels = {name: rows[:, names.index(output)].copy() for name, output in _channels(neck.robot).items()}
     lost = rows[:, names.index("measurement_valid")] < 0.5
-    lost |= np.arange(len(P)) % _between_samples(neck.robot, excitation.sample_time) > 0
+    rate = neck.robot.rate_hz  # rows without a sample where the robot's sensor is slower
+    every = 1 if rate is None else max(1, round(1.0 / (rate * excitation.sample_time)))
+    lost |= np.arange(len(P)) % every > 0
     for name in neck.robot.outputs.names:
         channels[name][lost] = np.nan
         channels[f"{name}_rate"][lost] = np.nan
@@ -94,11 +96,6 @@ def _channels(robot: Robot) -> dict[str, str]:
         **{f"tension_{j}": f"tension_{j}" for j in motors},
         "compression": "compression",
     }
-
-
-def _between_samples(robot: Robot, sample_time: float) -> int:
-    """Return how many rows go from one sample of the sensor to the next: 1 unless the robot's is slower."""
-    return 1 if robot.rate_hz is None else max(1, round(1.0 / (robot.rate_hz * sample_time)))
 
 
 def _inputs(block: Block, set_points: Matrix, payload: float) -> Matrix:

@@ -241,7 +241,7 @@ def _sections(demo: Demo) -> list[Section]:
         _overview(demo, first),
         _fits(demo),
         *(_validation_section(data, demo) for data in demo.experiments.judged if data != _FIRST_TEST),
-        *(Section(f"Closed loop: {to_words(name)}", charts=[_loop(name, demo.loops[name])]) for name in others),
+        *(Section(f"Closed loop: {name.replace('_', ' ')}", charts=[_loop(name, demo.loops[name])]) for name in others),
         _design_section(demo.designed),
         Section("Identified models", tables=[models]),
         Section("Experiment", charts=[recording_chart(item, _TITLES[name]) for name, item in recordings.items()]),
@@ -298,10 +298,5 @@ def _design_section(designed: DemoDesign) -> Section:
 
 
 def _loop(name: str, result: Result) -> Chart:
-    title = f"{to_words(name).capitalize()} of the virtual neck"
+    title = f"{name.replace('_', ' ').capitalize()} of the virtual neck"
     return loop_chart(result.signals.time, result.signals.signals, title, limits=result.bounds)
-
-
-def to_words(name: str) -> str:
-    """Return a loop's file name as words."""
-    return name.replace("_", " ")

@@ -132,7 +132,7 @@ def _is_worst(entry: Path) -> bool:
 def _files(root: Path) -> Iterator[Path]:
     """Yield files sorted by name; of a study's folder only `study.json`."""
     entries = sorted(root.iterdir())
-    if (root / "study.json").is_file() and _is_study(root / "study.json"):
+    if "study" in _content(root / "study.json"):
         yield root / "study.json"
         entries = [entry for entry in entries if entry.is_dir()]
     for entry in entries:
@@ -196,17 +196,13 @@ def _read_fmu(project: Project, path: Path, name: str) -> None:
 
 
 def _read_json(project: Project, path: Path, name: str) -> None:
-    if path.name == "study.json" and _is_study(path):
+    if path.name == "study.json" and "study" in _content(path):
         description, runs = read_study_description(path.parent), read_runs(path.parent)
         project.studies[Path(name).parent.as_posix()] = (description, runs)
         return
     content = _content(path)
     if content.get("certificate"):
         project.certificates[name] = content
-
-
-def _is_study(path: Path) -> bool:
-    return "study" in _content(path)
 
 
 def _content(path: Path) -> dict[str, Any]:

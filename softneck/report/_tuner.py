@@ -82,7 +82,8 @@ def tuner_values(found: Tuned, folder: Path, plants: Mapping[str, Path], certifi
         item, own = items[k], folder / f"{items[k].kind}-{number}.npz"
         broken = item.ratios(bounds, tested=task.tested)
         candidates.append({
-            "number": number, "kind": item.kind, "settings": _settings_text(item.settings), "best": item is found.best,
+            "number": number, "kind": item.kind, "best": item is found.best,
+            "settings": ", ".join(f"{name} {cell(value, '.4g')}" for name, value in item.settings.items()),
             "values": [_number(item.metrics.get(metric)) for metric in metrics],
             "unproven": [_unproven(item, bound, broken) for bound in bounds],
             "x": _number(item.metrics[x]), "y": _number(item.metrics[y]), "speed": shown.speed[k],
@@ -257,10 +258,6 @@ def _unit(metric: str, robot: Robot) -> str:
     shown = {"s": "s", "ms": "ms", "pct": "%", "deg": "deg", error_unit(robot)[0]: robot.outputs.display_unit}
     last = metric.rpartition(".")[2]
     return next((unit for end, unit in shown.items() if last.endswith(f"_{end}")), "")
-
-
-def _settings_text(settings: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {cell(value, '.4g')}" for name, value in settings.items())
 
 
 def _table(requirements: Sequence[Mapping[str, Any]]) -> str:

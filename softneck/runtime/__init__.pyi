@@ -24,7 +24,6 @@ from ._numba_cache import compile_without_failing_cache as compile_without_faili
 from ._numba_cache import numba_cache_name as numba_cache_name
 from ._own import PREFIX as PREFIX
 from ._own import OwnStep as OwnStep
-from ._own import own_of as own_of
 from ._own import own_runtime as own_runtime
 from ._tangent import with_tangent as with_tangent
 from ._tangent_activity import TangentError as TangentError

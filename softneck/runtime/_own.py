@@ -62,11 +62,6 @@ def own_runtime(own: OwnStep) -> str:
     return module.__name__
 
 
-def own_of(runtime: str) -> OwnStep:
-    """Return the object registered under a runtime's name."""
-    return sys.modules[runtime].own
-
-
 def own_text(module: str) -> str:
     """Return the runtime functions of the object in `module`."""
     return _SOURCE_TEMPLATE.format(module=module)

@@ -183,19 +183,19 @@ _BOUNDS = {"min": ">=", "max": "<=", "below": "<"}
 def verdict_table(found: Verification) -> Table:
     """Return a table of the requirements with value, limit, verdict and worst plant."""
     axes = found.controller.robot.outputs.names
-    rows = [[metric_title(v.requirement.metric), cell(v.value), _limit(v), _verdict_word(v), _worst_plant(v, axes)]
-            for v in found.verdicts]  # fmt: skip
+    words = {True: "holds", False: "fails", None: "does not decide"}
+    rows = [
+        [
+            metric_title(v.requirement.metric), cell(v.value), _limit(v),
+            "not computed" if v.value is None else words[v.holds], _worst_plant(v, axes),
+        ]
+        for v in found.verdicts
+    ]  # fmt: skip
     return Table("Requirements", ["metric", "value", "limit", "verdict", "worst plant"], rows)
 
 
 def _limit(verdict: Verdict) -> str:
     return f"{_BOUNDS[verdict.requirement.bound]} {verdict.requirement.limit:g}"
-
-
-def _verdict_word(verdict: Verdict) -> str:
-    if verdict.value is None:
-        return "not computed"
-    return {True: "holds", False: "fails", None: "does not decide"}[verdict.holds]
 
 
 def _worst_plant(verdict: Verdict, axes: tuple[str, ...]) -> str:

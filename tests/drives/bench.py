@@ -15,6 +15,7 @@ from softneck.drives.master._master import Measurement
 from softneck.drives.master._settings import RampSettings
 from softneck.drives.running._virtual import VirtualRun, simulated_plant
 from softneck.drives.simulated import SimulatedDrive, SimulatedNeck
+from softneck.drives.simulated._drives import SimulatedDrives
 from softneck.drives.simulated._quirks import DriveQuirks
 from softneck.plant import NeckParameters
 from softneck.plant._neck_runtime import VirtualNeckArrays, VirtualNeckState
@@ -26,8 +27,9 @@ FAULT, REACTION, ENABLED, DISABLED = 0x08, 0x0F, 0x27, 0x40
 FAST = RampSettings(speed=3.0, settle=0.04, tolerance=0.2)
 
 
-def tear(neck: SimulatedNeck, tendon: int) -> None:
+def tear(neck: SimulatedDrives, tendon: int) -> None:
     """Make a tendon slack, one metre too long; the first has number 1."""
+    assert isinstance(neck, SimulatedNeck)
     neck._x[VirtualNeckState.parts(VirtualNeckArrays(neck._arrays))["free"]][tendon - 1] += 1.0
 
 

@@ -264,7 +264,7 @@ def _controller(options: Options) -> Iterator[Step]:
     fmus = _fmus(plant, options)
     yield Step(stage="tune", command=command, makes=(BEST, _TUNED_LOOP, "tune/report.html", TUNER),
                reads=(*plants, OBSERVER, *wanted), finding=finding, beside=tuple(fmus[:2]))  # fmt: skip
-    eyes = (OBSERVER,) if uses_observer() else ()
+    eyes = (OBSERVER,) if "observer" in read_toml(_TUNED_LOOP) else ()
     command = ("softneck", "verify", BEST, *plants, "--requirements", _REQUIREMENTS,
                *(word for file in eyes for word in ("--observer", file)),
                "-o", CERTIFICATE, "--html", "build/verify.html", "--force")  # fmt: skip
@@ -283,11 +283,6 @@ def _fmus(plant: str, options: Options) -> list[Step]:
         Step(stage="FMUs", command=("softneck", "fmu", file, "--backend", made, "-o", fmu, "--force"), makes=(fmu,),
              reads=(file,)) for file, fmu in ((plant, PLANT_FMU), (OBSERVER, OBSERVER_FMU), (BEST, CONTROLLER_FMU))
     ]  # fmt: skip
-
-
-def uses_observer() -> bool:
-    """Return whether `tune` found the loop better with an observer."""
-    return "observer" in read_toml(_TUNED_LOOP)
 
 
 def _loops(options: Options) -> Iterator[Step]:

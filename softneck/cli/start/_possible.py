@@ -38,8 +38,7 @@ def require_disk(folder: Path) -> None:
 def backend(*, packaged: bool = True) -> str:
     """Return the backend of the FMUs: "python", with a note, if no C compiler or library is found.
 
-    Args:
-        packaged: whether the robot has 3 motors and 2 outputs; softneck contains libraries for these only.
+    `packaged`: whether the robot has 3 motors and 2 outputs; softneck contains libraries for these only.
     """
     from softneck.fmu.compiled import _library
 
@@ -73,11 +72,7 @@ def require_known(robot: Robot) -> None:
 
 
 def possible(plants: tuple[str, ...]) -> str:
-    """Write `FILE` without the infeasible defaults of `tune`, and return the reasons; empty if all are feasible.
-
-    Args:
-        plants: files of the models that `tune` is given.
-    """
+    """Write `FILE` without the defaults of `tune` that are infeasible for its `plants`; return the reasons, or ""."""
     refused = impossible(plants)
     if refused:
         said = "".join(f"# {why}\n" for why in refused.values())

@@ -25,9 +25,7 @@ _STUDY_RUNS = 30
 def project_of_loop(loop_file: Path, folder: Path) -> dict[str, str]:
     """Return file name -> text of a project around the loop that `softneck tune` wrote.
 
-    Args:
-        loop_file: the loop; its parts are taken from `fmus/`.
-        folder: of the project, whose robot says how noisy its sensor is.
+    Parts of the loop are taken from `fmus/`; the robot in `folder` says how noisy its sensor is.
     """
     robot = find_robot(beside=folder / "loop.toml")
     loop = _over_fmus(_read(loop_file), robot)

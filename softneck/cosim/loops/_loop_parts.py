@@ -18,7 +18,7 @@ from softneck.robot import Robot, find_robot
 from softneck.runtime import Block, Port
 from softneck.signals import read_recording, require_same_robot
 
-from ..parts._fmu_part import FmuPart
+from ..parts._fmu_part import FmuPart, naming_arguments
 from ..parts._isolated import IsolatedPart
 
 
@@ -215,7 +215,9 @@ class PartOpener:
             ports = {"inputs": _with_names(block.inputs, names), "outputs": _with_names(block.outputs, names)}
             return BlockPart(replace(block, **ports))
         if isinstance(part, FmuPart | IsolatedPart):
-            return part.with_names(names) if names else part
+            settings: Any = {"role": part.role, "sample_time": part.sample_time}
+            settings |= {"timeout": part.timeout} if isinstance(part, IsolatedPart) else {}
+            return type(part)(part.path, **settings, **naming_arguments(part, names)) if names else part
         made: Any = _RenamedPart(part, names) if names else part
         return made
 

@@ -96,11 +96,6 @@ class FmuPart:
         self._folder: Path | None = None
         self._broken = False
 
-    def with_names(self, names: Mapping[str, str]) -> FmuPart:
-        """Return the same part with other names for its variables: name here -> new name."""
-        settings = {"role": self.role, "sample_time": self.sample_time}
-        return FmuPart(self.path, **settings, **naming_arguments(self, names))  # pyright: ignore[reportArgumentType]
-
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
         """Instantiate and initialise the FMU at `time` [s]; return its outputs (n_out,) there.
 

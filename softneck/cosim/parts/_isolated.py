@@ -31,7 +31,7 @@ from softneck.core import (
 )
 from softneck.loop import EndedError
 
-from ._fmu_part import FmuError, FmuPart, naming_arguments
+from ._fmu_part import FmuError, FmuPart
 
 _ERRORS: dict[str, type[SoftneckError]] = {
     kind.__name__: kind for kind in (FmuError, EndedError, DataError, FileFormatError, OutputFileError, SettingsError)
@@ -70,11 +70,6 @@ class IsolatedPart:
             "names": dict(names or {}), "units": dict(units or {}),
         }  # fmt: skip
         self._child: _Child | None = None
-
-    def with_names(self, names: Mapping[str, str]) -> IsolatedPart:
-        """Return the same part with other names for its variables, as `FmuPart.with_names`."""
-        settings: Any = {"role": self.role, "sample_time": self.sample_time, "timeout": self.timeout}
-        return IsolatedPart(self.path, **settings, **naming_arguments(self, names))
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
         """Start a run as `FmuPart.start`; raise FmuError also if the FMU crashed or hung."""

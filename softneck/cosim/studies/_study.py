@@ -59,11 +59,6 @@ class Vary:
         """Whether all values are used."""
         return self.kind == "grid"
 
-    @property
-    def is_drawn(self) -> bool:
-        """Whether a value is drawn for each sample."""
-        return self.kind not in ("grid", "seed")
-
     def pick(self, u: float) -> tuple[Any, Any]:
         """Return the value at quantile `u` (0 to 1) and its label in tables."""
         from scipy.stats import norm
@@ -135,7 +130,7 @@ class StudyPoints:
         if size > _MAX_RUNS:
             raise SettingsError(f"the grid has {size} points; at most {_MAX_RUNS} fit. Make it smaller, or draw.")
         self._grid = list(product(*grids))
-        drawn = [key for key, item in vary.items() if item.is_drawn]
+        drawn = [key for key, item in vary.items() if item.kind not in ("grid", "seed")]
         random = bool(drawn) or any(item.kind == "seed" for item in vary.values())
         self.runs = _number_of_runs(runs, len(self._grid), random=random)
         samples = -(-self.runs // len(self._grid))

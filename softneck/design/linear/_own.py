@@ -14,7 +14,7 @@ import numpy as np
 
 from softneck.core import ReprMixin, SettingsError, require_positive, to_si
 from softneck.robot import Robot, find_robot
-from softneck.runtime import PREFIX, Block, OwnStep, Port, own_of, own_runtime
+from softneck.runtime import PREFIX, Block, OwnStep, Port, own_runtime
 
 from ._ports import controller_inputs, controller_outputs
 
@@ -101,10 +101,9 @@ def own_object(thing: Any) -> Any:
 def own_module(runtime: str) -> tuple[str, str]:
     """Return name and text of a module that holds the object of a runtime where softneck is not.
 
-    Raises:
-        SettingsError: its class has no file of its own, or the object holds more than numbers, texts and arrays.
+    Raises SettingsError: its class has no file of its own, or the object holds more than numbers, texts and arrays.
     """
-    own = own_of(runtime)
+    own = sys.modules[runtime].own
     kind = type(own.stepped)
     try:
         source = Path(inspect.getfile(kind)).read_text(encoding="utf-8")

@@ -19,7 +19,7 @@ from ._controller import AxisController, ReferenceFilter, pi_axis
 from ._settings import PLANT, AxisDesign, AxisSettings, margins_json
 
 if TYPE_CHECKING:
-    import control
+    pass
 
 TUNINGS = ("nominal", "samples")
 
@@ -225,15 +225,6 @@ def reference_time(plants: Plants, extra_delay: int, gains: Gains, *, gain_sprea
     raise SettingsError("no reference filter keeps the overshoot; lower `max_sensitivity` or `gain_spread`.")
 
 
-def open_loop(plant: AxisPlant, extra_delay: int, gains: Gains) -> control.TransferFunction:
-    """Return the discrete open loop of a PI with the plant, its delay exact."""
-    import control
-
-    rate = plant.sample_time / gains.integral_time
-    pi = control.TransferFunction([gains.gain, gains.gain * (rate - 1.0)], [1.0, -1.0], plant.sample_time)
-    return pi * plant.tf(extra_delay=extra_delay)
-
-
 def _largest_size(shape: Matrix, max_sensitivity: float, phase_margin: float) -> float:
     """Return the largest size up to which all loops size * shape (plants, frequencies) keep both bounds, or 0.
 
@@ -262,9 +253,12 @@ def _keeps(loops: Matrix, max_sensitivity: float, phase_margin: float) -> bool:
 
 def _step_response(plant: AxisPlant, extra_delay: int, gains: Gains, rows: int, scale: float) -> Vector:
     """Return the closed loop's step response (rows,), the plant's gain scaled, without limits."""
+    import control
     from scipy.signal import lfilter
 
-    loop = open_loop(plant, extra_delay, gains)
+    rate = plant.sample_time / gains.integral_time
+    pi = control.TransferFunction([gains.gain, gains.gain * (rate - 1.0)], [1.0, -1.0], plant.sample_time)
+    loop = pi * plant.tf(extra_delay=extra_delay)
     numerator, denominator = scale * np.asarray(loop.num[0][0]), np.asarray(loop.den[0][0])
     padded = np.concatenate([np.zeros(denominator.size - numerator.size), numerator])
     return np.asarray(lfilter(padded, denominator + padded, np.ones(rows)))

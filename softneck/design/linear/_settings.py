@@ -98,11 +98,7 @@ class LoopSettings:
         return {"lead_limit": self.LEAD * Scaling.of(plant.robot).motor_unit}
 
     def limits(self, robot: Robot) -> ControllerLimits:
-        """Return the limits of the set-points.
-
-        Raises:
-            SettingsError: a robot's limit that its file does not say.
-        """
+        """Return the limits of the set-points. Raises SettingsError: a robot's limit that its file does not say."""
         return limits_of(robot, lead_limit=self.lead_limit, least_cocontraction=self.least_cocontraction)
 
     @property
@@ -261,8 +257,10 @@ class AxisSettings(LoopSettings, ABC):
         controller = self._choose_conditioning(controller, led, axis)
         margins = axis_margins(controller, plants, self.extra_delay)
         worst = margins.worst()
+        more = {"reference_lead_s": led.lead} if led.lead else {}
+        more |= {"feedforward": feedforward} if feedforward else {}
         findings = {
-            "gains": {**found.gains, **filter_numbers(led), **({"feedforward": feedforward} if feedforward else {})},
+            "gains": {**found.gains, "reference_time_s": led.time, **more},
             "dead_time_s": (axis.nominal.delay + self.extra_delay) * axis.sample_time,
             "margins": margins_json(margins.of(0)),
             "states": int(controller.A.shape[0]),
@@ -454,11 +452,6 @@ def least_filter(keeps: Callable[[int], bool], low: int, high: int, sample_time:
 def cocontraction_filter(filters: Sequence[ReferenceFilter]) -> ReferenceFilter:
     """Return the filter of the co-contraction reference: the slowest of `filters`, without lead."""
     return ReferenceFilter(max(item.time for item in filters))
-
-
-def filter_numbers(led: ReferenceFilter) -> dict[str, float]:
-    """Return the numbers of a reference filter by name."""
-    return {"reference_time_s": led.time, **({"reference_lead_s": led.lead} if led.lead else {})}
 
 
 def _fastest_filter(plant: AxisPlant) -> int:

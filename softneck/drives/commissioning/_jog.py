@@ -135,7 +135,10 @@ def jog(
     time, rows = np.arange(len(path)) * SAMPLE_TIME, _rows(path, motor, motors)
     session = replace(session, facts={**session.facts, "jog": played})
     run = record_signal([Excitation(f"motor {motor}", time, rows, SAMPLE_TIME)], session, report=report)
-    ways = _ways(session, tendon_angles)
+    # The direction in which each motor moves the outputs; none where they are to be identified.
+    ways = list(zip(*session.file.weights, strict=True))
+    if tendon_angles is not None:
+        ways = [(math.cos(angle), math.sin(angle)) for angle in tendon_angles]
     way = 0.5 * (amplitude - lowest) * session.file.watch.gain
     expected = tuple(way * part for part in ways[motor - 1]) if ways else (math.nan,) * len(outputs)
     found = JogResult(
@@ -151,13 +154,6 @@ def jog(
     if verdict == "no movement" and turned < 0.5 * (amplitude - lowest):
         advice = f"The motor itself turned by {turned:.2f} of {amplitude - lowest:g} rad: is it blocked? {advice}"
     return replace(found, seen=seen, noise=noise, turned=turned, verdict=verdict, advice=advice)
-
-
-def _ways(session: Session, tendon_angles: tuple[float, ...] | None) -> list[tuple[float, ...]]:
-    """Return the direction in which each motor moves the outputs; none where they are to be identified."""
-    if tendon_angles is not None:
-        return [(math.cos(angle), math.sin(angle)) for angle in tendon_angles]
-    return list(zip(*session.file.weights, strict=True))
 
 
 def jog_pilot(motor: int, amplitude: float, lowest: float | None = None, motors: int = 3) -> SignalPilot:

@@ -48,12 +48,6 @@ _REPLAY_ROWS = 10
 _OVERRIDE_WAY = "or let it pass by name with --override certificate."
 
 
-def files_that_act(setup: LoopSetup, controller: Path, drives: Path | None = None) -> list[Path]:
-    """Return the files of a run that its certificates must cover: all but the plant, which is hardware now."""
-    roles = {role: Path(path) for role, (path, _) in setup.files.items() if role not in ("plant", "controller")}
-    return [controller, *roles.values(), *([] if drives is None else [drives])]
-
-
 def require_certified(
     setup: LoopSetup,
     controller: Path,
@@ -88,7 +82,10 @@ def require_certified(
         )
     verified = _covering("verify", certificates, controller, [controller])
     _require_minimum(verified, robot or NECK)
-    simulated = _covering("simulate", certificates, loop, files_that_act(setup, controller, drives))
+    # All but the plant, which is hardware now.
+    acting = [Path(path) for role, (path, _) in setup.files.items() if role not in ("plant", "controller")]
+    acting += [controller, *([] if drives is None else [drives])]
+    simulated = _covering("simulate", certificates, loop, acting)
     for found in (verified, simulated):
         _require_robot(found, robot or NECK)
     covered = float(simulated.contents.get("duration_s") or 0.0)
@@ -195,8 +192,7 @@ def _as_strict(row: dict, bound: str, limit: float) -> bool:
 def require_same_again(loop: Loop, certificate: Certificate) -> float:
     """Run `loop` on its own plant and compare it with its certificate; return how much of it was compared [s].
 
-    Raises:
-        CheckFailedError: set-points or angles part by more than 1e-4 rad, or the certificate keeps none.
+    Raises CheckFailedError: set-points or angles part by more than 1e-4 rad, or the certificate keeps none.
     """
     trace = certificate.contents.get("trace")
     if not isinstance(trace, dict) or not trace.get("row"):

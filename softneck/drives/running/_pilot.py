@@ -165,7 +165,8 @@ class RunLog:
             places[f"{name}_estimate"] = pilot.slot("observer", name)
         places["healthy"] = pilot.slot("observer", "healthy")
         self._places = {name: place for name, place in places.items() if place is not None}
-        self._truths = self._true_names() if truth else ()
+        true = (*pilot.robot.outputs.names, *truths(pilot.robot))
+        self._truths = () if not truth else true if pilot.robot.neck is not None else true[:-1]
         self._names = self._column_names()
         self._rows = Rows(len(self._names), len(pilot.robot.motors.names), folder)
         self._index = -1
@@ -193,10 +194,6 @@ class RunLog:
         names += [f"tension_estimate_{j}" for j in range(1, len(robot.motors.names) + 1)]
         names += [f"{name}{what}_measured" for what in ("", "_rate") for name in robot.outputs.names]
         return [*names, *self._truths]
-
-    def _true_names(self) -> tuple[str, ...]:
-        names = (*self._robot.outputs.names, *truths(self._robot))
-        return names if self._robot.neck is not None else names[:-1]
 
     def finish(self, sample_time: float) -> tuple[LoopResult, Matrix, tuple[str, ...]]:
         """Return all rows, the motors' speeds at them, (rows, motors) [rad/s], and notes on the disk."""

@@ -431,10 +431,6 @@ def _guarding(objects: Objects, wanted: str, rows: Report) -> tuple[str, frozens
     return "", has
 
 
-def _object_list(indices: Sequence[int]) -> str:
-    return ", ".join(f"{index:04X}h" for index in indices)
-
-
 def _apply(objects: Objects, topic: str, writes: Sequence[Write], rows: Report) -> None:
     """Write all of one topic and read each back."""
     for write in writes:

@@ -240,18 +240,13 @@ def _lags(step: float) -> tuple[int, ...]:
     return tuple(sorted({0, 1, 2, *np.unique(np.round(np.geomspace(3, last, _LAG_COUNT - 2)).astype(int)).tolist()}))
 
 
-def _lag_matrix(s: _Samples, lags: tuple[int, ...]) -> Matrix:
-    last = lags[-1]
-    columns = [s.positions[last - lag : len(s.positions) - lag] for lag in lags]
-    return np.hstack(columns)
-
-
 def _tilt_gains(samples: Sequence[_Samples], lags: tuple[int, ...]) -> Matrix:
     """Fit the gains (outputs, lags x motors) by least squares, with a separate offset for each segment."""
     X, y = [], []
     for s in samples:
         good = (np.convolve(~s.taut, np.ones(lags[-1] + 1))[: len(s.taut)] < 0.5)[lags[-1] :]
-        x, v = _lag_matrix(s, lags)[good], s.values[lags[-1] :][good]
+        x = np.hstack([s.positions[lags[-1] - lag : len(s.positions) - lag] for lag in lags])[good]
+        v = s.values[lags[-1] :][good]
         if len(x) > 1:
             X.append(x - x.mean(axis=0))
             y.append(v - v.mean(axis=0))

@@ -85,7 +85,9 @@ def build_compiled_fmu(
     block = with_limit_outputs(block)  # the library's own parameter, which no runtime reads
     modules = node_of(block.runtime, block.arrays).modules
     library = find_library(modules, sensitivities=True) if ports else find_library(modules)
-    _check_kinds(modules, library.sources)
+    for module in sorted(modules & library.sources.refused.keys()):
+        why = library.sources.refused[module]
+        raise SettingsError(f"`{module}` cannot be in a compiled FMU: {why} Use `--backend python`.")
     folders = _folders(library, platforms, fmi)
     block = replace(block, outputs=(*block.outputs, *ports))
     members = _members(block, said, name, fmi, library.sources, looks)
@@ -93,13 +95,6 @@ def build_compiled_fmu(
     with atomic_write(target, force=force) as temporary:
         write_zip(temporary, members, library.streams)
     return library.origin
-
-
-def _check_kinds(modules: set[str], sources: Sources) -> None:
-    for module in sorted(modules & sources.refused.keys()):
-        raise SettingsError(
-            f"`{module}` cannot be in a compiled FMU: {sources.refused[module]} Use `--backend python`."
-        )
 
 
 def _folders(library: Library, wanted: Sequence[str], fmi: int) -> list[tuple[str, str, bytes]]:

@@ -66,11 +66,6 @@ def regressor_scale(table: Matrix, scaling: Scaling, base_rest: Vector | float =
     return rests, units
 
 
-def history_length(table: Matrix, drive: DriveModel) -> int:
-    """Return the number of samples that the runtime must store for this table and drive."""
-    return int(max(table[:, 2].max(), drive.delay.max(), 1))
-
-
 def motor_signals(recording: Recording, drive: DriveModel, *, again: bool = False) -> Recording:
     """Add motor positions of the drive model to a recording without logged ones, or with `again` to any."""
     if recording.has_motor_positions and not again:

@@ -22,7 +22,7 @@ from ..models._drive import DriveModel
 from ..models._fitting import ScaledData
 from ..models._linear_systems import history_array
 from ..models._model import WARM_UP, Model
-from ..models._regressors import history_length, motor_signals, regression, regressor_scale
+from ..models._regressors import motor_signals, regression, regressor_scale
 from ..models._scores import nrmse_fit
 
 # The last level has at most so many points in a node, and (of more than one node) at least half as many.
@@ -391,7 +391,7 @@ class Ground:
 
     def arrays(self, data: Data, scale: Vector, gamma: Vector, epsilon: Vector) -> dict[str, Matrix]:
         """Return the runtime's arrays of the set of `data`; gamma and epsilon (outputs,), scale (n,)."""
-        history = history_length(self.table, self.drive)
+        history = int(max(self.table[:, 2].max(), self.drive.delay.max(), 1))  # samples that the runtime stores
         base = no_base(len(self.drive.pole), len(data))
         if self.base is not None:
             base = {name: self.base.arrays[name] for name in base}

@@ -114,7 +114,10 @@ class Unit:
         table = "static const sn_kind sn_kinds[] = {\n" + "\n".join(self.kinds) + "\n};\n"
         count = f"static const int sn_kind_count = {len(self.kinds)};\n"
         fast = self._fast()
-        functions = [_mark_fast(text) if defined_name(text) in fast else _mark_small(text) for text in self.functions]
+        functions = [
+            _mark_fast(text) if defined_name(text) in fast else text.replace("\nstatic ", "\nSN_SMALL static ", 1)
+            for text in self.functions
+        ]
         return "\n".join([head, guard, *self.types.declarations, "", *functions, table, count, "#endif\n"])
 
     def _fast(self) -> set[str]:
@@ -270,10 +273,6 @@ def _tangent_of(runtime: _Runtime, arrays: Arrays) -> str:
 def _mark_fast(text: str) -> str:
     """Return a function as inline, with inline checks of whole numbers."""
     return text.replace("sn_int(", "sn_int_here(").replace("\nstatic ", "\nstatic inline ", 1)
-
-
-def _mark_small(text: str) -> str:
-    return text.replace("\nstatic ", "\nSN_SMALL static ", 1)
 
 
 def _constants(tree: ast.Module) -> dict[str, ast.expr]:
