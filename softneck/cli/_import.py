@@ -192,7 +192,7 @@ def command(
     if html is not None:
         refuse_existing(html, force=force)
     if alone:
-        _finish(job, *(_run_log(log) if ours else _read_recorded(log, robot)))
+        _finish(job, *_read_known(log, robot, ours=ours))
         return
     facts: dict[str, Any] = {}
     given = robot is not None or robot_file_of(log) is not None
@@ -225,14 +225,11 @@ def _output_of_neck(log: Path, named: signals.NamedColumns | None) -> str | None
     return output
 
 
-def _read_recorded(log: Path, robot: str | None) -> tuple[signals.ImportResult, dict[str, Any]]:
-    """Return a recording to be resampled."""
-    before = signals.read_recording(log, robot=robot)
-    return signals.ImportResult(before, ()), {"sample_time_before_s": before.sample_time}
-
-
-def _run_log(log: Path) -> tuple[signals.ImportResult, dict[str, Any]]:
-    """Return the recording of a run on drives."""
+def _read_known(log: Path, robot: str | None, *, ours: bool) -> tuple[signals.ImportResult, dict[str, Any]]:
+    """Return the recording of a run on drives (`ours`), or a recording to be resampled."""
+    if not ours:
+        before = signals.read_recording(log, robot=robot)
+        return signals.ImportResult(before, ()), {"sample_time_before_s": before.sample_time}
     run = drives.read_run_log(log)
     notes = (f"{log}: {run.cut}: imported up to the cut",) if run.cut else ()
     return signals.ImportResult(run.recording(), notes), {}

@@ -346,11 +346,6 @@ def _scale_seconds(seconds: float, model: Model) -> float:
     return seconds * ((time_constant_of(model) or NECK_SECONDS) / NECK_SECONDS)
 
 
-def adapt_model(model: Model, recording: Recording, window: float | None) -> Model:
-    """Return `model.adapt(recording, window=window)`."""
-    return Adaptation(window=window).of(model, recording)
-
-
 def _accept_if_better(model: Model, window: Recording, problem: Problem, z: Vector, held: np.ndarray) -> Model:
     """Return the adapted model if no output is worse over the rows held out, else the old one."""
     seconds, rows = len(window) * window.sample_time, int(held.any(axis=1).sum())

@@ -20,6 +20,7 @@ from ._chart import MOTOR_COLOURS as MOTOR_COLOURS
 from ._chart import ORANGE as ORANGE
 from ._chart import curve_styles as curve_styles
 from ._chart import in_display_unit as in_display_unit
+from ._chart import signals_figure as signals_figure
 from ._charts import cover_chart as cover_chart
 from ._charts import distribution_chart as distribution_chart
 from ._charts import frequency_response_chart as frequency_response_chart

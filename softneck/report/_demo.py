@@ -123,7 +123,9 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
     judged = judge(models, experiments, tell=tell)
     plants = {**models, "virtual_neck": VirtualNeck(neck)}
     compared = experiments.tests["rotation"].rows(0, settings.compare_rows)
-    scores = {name: score_line(judged, name) for name in models}
+    scores = dict.fromkeys(models, "simulation (free run) fit from set-points alone [%], pitch/roll")
+    for (name, data), pair in judged.items():
+        scores[name] += f"\n{data}: {cell(pair.free.fits[INFINITE], '.1f')}"
     packaged = package(plants, out / "fmus", compared, scores=scores, tell=tell)
     designed = design(models["rls"], out / "fmus")
     designed.controller.save(out / "models" / "pi.npz", force=True)
@@ -211,13 +213,6 @@ def loop_rows(loops: Mapping[str, Result]) -> tuple[list[str], Rows]:
         for name, row in limits_of(loops)
     ]
     return ["loop and metric", "value", "limit", "verdict"], rows
-
-
-def score_line(judged: Mapping[tuple[str, str], ValidationPair], model: str) -> str:
-    """Return a model's simulation fits as text for its FMU."""
-    lines = ["simulation (free run) fit from set-points alone [%], pitch/roll"]
-    lines += [f"{data}: {cell(r.free.fits[INFINITE], '.1f')}" for (name, data), r in judged.items() if name == model]
-    return "\n".join(lines)
 
 
 _LOOP_NOTE = "Plant, observer and controller are FMUs in fmpy; the plant is the virtual neck with its inclinometer."

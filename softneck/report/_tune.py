@@ -336,20 +336,15 @@ def _front(found: Tuned) -> Section:
         for item in found.front[:_MAX_FRONT_ROWS]
     ]  # fmt: skip
     more = len(found.front) - _MAX_FRONT_ROWS
+    robot, size = found.task.robot, float(found.task.asked.certificate.sim["size_deg"])
+    plants = "all simulation models and payloads" if found.task.own else "all linear plants"
     text = [
         f"{len(found.front)} candidates that none beats in every objective; all are in pareto.csv.",
-        f"Each value is the worst of the loops of the search alone ({_plants_of_search(found)}); the certificate, "
-        "above, has more plants.",
+        f"Each value is the worst of the loops of the search alone ({plants}, steps of up to {size:.4g} "
+        f"{robot.outputs.display_unit}); the certificate, above, has more plants.",
     ]
     text += [f"The first {_MAX_FRONT_ROWS} by {found.objectives[0]}."] if more > 0 else []
     return Section("Pareto front", text=text, tables=[Table("", ["kind", "settings", *found.objectives], rows, text=2)])
-
-
-def _plants_of_search(found: Tuned) -> str:
-    """Return the plants and the steps of the search's loops in words."""
-    robot, size = found.task.robot, float(found.task.asked.certificate.sim["size_deg"])
-    plants = "all simulation models and payloads" if found.task.own else "all linear plants"
-    return f"{plants}, steps of up to {size:.4g} {robot.outputs.display_unit}"
 
 
 def _label(found: Tuned, item: Candidate) -> str:

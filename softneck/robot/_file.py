@@ -74,11 +74,6 @@ def preset_text(name: str) -> str:
     return files("softneck.robot").joinpath("presets", f"{name}.toml").read_text(encoding="utf-8")
 
 
-def preset_table(name: str) -> dict[str, Any]:
-    """Return the tables of a preset."""
-    return tomllib.loads(preset_text(name))
-
-
 def fields(table: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of `Robot` for the tables of a file, with the values of the preset that it extends.
 
@@ -166,7 +161,7 @@ def _extend(table: Mapping[str, Any]) -> dict[str, Any]:
     """Return the tables merged key by key with those of the preset that they extend."""
     if "extends" not in table:
         return dict(table)
-    base = _extend(preset_table(table["extends"]))
+    base = _extend(tomllib.loads(preset_text(table["extends"])))
     for name, others in _IN_UNIT.items():
         new = table.get(name, {})
         if new.get("unit", base[name]["unit"]) != base[name]["unit"]:

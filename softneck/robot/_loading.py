@@ -75,7 +75,9 @@ def load_for_robot(thing: Any, role: str | None = None, robot: str | Path | Robo
     path = thing if isinstance(thing, str | Path) else None
     found: Any = thing if path is None else load(path, role=role)
     if path is None and (isinstance(thing, type) or not hasattr(thing, _METHOD_OF_ROLE.get(role or "", "__class__"))):
-        raise SettingsError(f"{_a(role or 'thing')} or its file is needed; got a {type(thing).__name__}.")
+        wanted = role or "thing"
+        article = "an" if wanted[0] in "aeiou" else "a"
+        raise SettingsError(f"{article} {wanted} or its file is needed; got a {type(thing).__name__}.")
     own = getattr(found, "robot", None)
     if own is None or (robot is None and (path is None or robot_file_of(path) is None)):
         return found
@@ -84,7 +86,3 @@ def load_for_robot(thing: Any, role: str | None = None, robot: str | Path | Robo
         raise DataError(f"{path or 'it'}: is of robot {own.label()}, not of {given.label()}.")
     # A controller keeps its limits, as it was designed for them.
     return replace(found, robot=given) if "robot" in (field.name for field in fields(found)) else found
-
-
-def _a(word: str) -> str:
-    return f"{'an' if word[0] in 'aeiou' else 'a'} {word}"

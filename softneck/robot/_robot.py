@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -318,7 +319,7 @@ def _hash(robot: Robot) -> str:
 
 @cache
 def _preset(name: str) -> Robot:
-    return Robot(**_file.fields(_file.preset_table(name)))
+    return Robot(**_file.fields(tomllib.loads(_file.preset_text(name))))
 
 
 def _shorten(key: str, value: Any) -> Any:

@@ -63,7 +63,6 @@ from .recording._files import recording_suffix as recording_suffix
 from .recording._files import robot_in_file as robot_in_file
 from .recording._labelled import Labelled as Labelled
 from .recording._labelled import dataset as dataset
-from .recording._labelled import signals_figure as signals_figure
 from .recording._labelled import table as table
 from .recording._recording import conditions as conditions
 from .recording._recording import merge_conditions as merge_conditions

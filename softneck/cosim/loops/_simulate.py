@@ -25,7 +25,7 @@ from softneck.identification import find_farthest_motor
 from softneck.loop import BlockPart, LoopResult, Part, StepCallback, System, check_limits, metrics, run_loop
 from softneck.loop import Loop as Loop  # re-exported by the subpackage
 from softneck.robot import Robot
-from softneck.signals import Recording, dataset, file_unit, known_channels, signals_figure, table
+from softneck.signals import Recording, dataset, file_unit, known_channels, table
 
 from ._loop_file import LoopSetup, load_loop, load_ssp, make_loop
 
@@ -120,7 +120,7 @@ class Result(ReprMixin):
 
     def plot(self, title: str = "") -> Figure:
         """Return a matplotlib figure: references, outputs and motors of a closed loop, or all signals of a system."""
-        from softneck.plots import chart_figure, loop_chart  # imports matplotlib
+        from softneck.plots import chart_figure, loop_chart, signals_figure  # imports matplotlib
 
         time, signals = self.signals.time, self.signals.signals
         if not self.closed:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,9 +17,6 @@ from ..plants._uncertain import UncertainAxis, UncertainPlant
 from ._axis_loop import LOWEST, axis_margins, bisect, coarse_frequencies, frequencies, unstable_samples
 from ._controller import AxisController, ReferenceFilter, pi_axis
 from ._settings import PLANT, AxisDesign, AxisSettings, margins_json
-
-if TYPE_CHECKING:
-    pass
 
 TUNINGS = ("nominal", "samples")
 

@@ -215,7 +215,8 @@ class AxisSettings(LoopSettings, ABC):
             sample_time=uncertain.sample_time,
             arrays=assemble(
                 [made[name][0] for name in axes],
-                filters=(*filters, cocontraction_filter(filters)),
+                # Of co-contraction the slowest, without lead.
+                filters=(*filters, ReferenceFilter(max(item.time for item in filters))),
                 redefinition=redefinition,
                 constants=limits.constants(uncertain.sample_time),
             ),
@@ -447,11 +448,6 @@ def least_filter(keeps: Callable[[int], bool], low: int, high: int, sample_time:
         middle = (low + high) // 2
         low, high = (low, middle) if keeps(middle) else (middle, high)
     return high * sample_time
-
-
-def cocontraction_filter(filters: Sequence[ReferenceFilter]) -> ReferenceFilter:
-    """Return the filter of the co-contraction reference: the slowest of `filters`, without lead."""
-    return ReferenceFilter(max(item.time for item in filters))
 
 
 def _fastest_filter(plant: AxisPlant) -> int:

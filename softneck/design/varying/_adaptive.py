@@ -19,7 +19,7 @@ from ..linear._axis_loop import LOWEST, filter_for_lag, frequencies
 from ..linear._controller import ReferenceFilter, assemble, pi_axis, robot_in
 from ..linear._linear_parts_runtime import LinearArrays
 from ..linear._ports import ControllerLimits, controller_inputs, controller_outputs
-from ..linear._settings import LoopSettings, cocontraction_filter
+from ..linear._settings import LoopSettings
 from ..plants._uncertain import UncertainPlant, scale_gain, uncertain_plant
 from ._adaptive_runtime import AdaptiveArrays
 
@@ -231,7 +231,7 @@ class AdaptiveSettings(LoopSettings):
         if self.rise_s is None:
             return (ReferenceFilter(self.reference_time or 0.0),) * (len(plants) + 1)
         each = [filter_for_lag(self.rise_s, 1.0 / _pole(plant)) for plant in plants]
-        return (*each, cocontraction_filter(each))
+        return (*each, ReferenceFilter(max(item.time for item in each)))
 
     def _arrays(
         self, plants: list[AxisPlant], delays: list[int], kappas: list[float], limits: ControllerLimits,

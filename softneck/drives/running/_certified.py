@@ -83,8 +83,8 @@ def require_certified(
     verified = _covering("verify", certificates, controller, [controller])
     _require_minimum(verified, robot or NECK)
     # All but the plant, which is hardware now.
-    acting = [Path(path) for role, (path, _) in setup.files.items() if role not in ("plant", "controller")]
-    acting += [controller, *([] if drives is None else [drives])]
+    others = [Path(path) for role, (path, _) in setup.files.items() if role not in ("plant", "controller")]
+    acting = [controller, *others, *([] if drives is None else [drives])]
     simulated = _covering("simulate", certificates, loop, acting)
     for found in (verified, simulated):
         _require_robot(found, robot or NECK)

@@ -273,7 +273,7 @@ class Model(ReprMixin):
             SettingsError: a kind that cannot adapt.
         """
         # Resolved by name, as `adaptation` imports this module.
-        return resolve("softneck.identification._adapt:adapt_model")(self, recording, window)
+        return resolve("softneck.identification._adapt:Adaptation")(window=window).of(self, recording)
 
     def tf(
         self,

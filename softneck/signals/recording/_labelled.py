@@ -63,7 +63,8 @@ class Labelled(np.ndarray):
 
     def plot(self, title: str = "") -> Figure:
         """Return a matplotlib figure with one panel for each unit; angles in degrees."""
-        return signals_figure(*self._parts(), title)
+        # Plots are a layer above signals, so that they are resolved by name.
+        return resolve("softneck.plots:signals_figure")(*self._parts(), title)
 
     def __repr__(self) -> str:
         if not self.channels:
@@ -94,9 +95,3 @@ def dataset(time: Vector, columns: Mapping[str, Vector], units: Mapping[str, str
 
     found = {name: ("time", values, {"units": units[name]}) for name, values in columns.items()}
     return xarray.Dataset(found, coords={"time": ("time", time, {"units": "s"})})
-
-
-def signals_figure(time: Vector, columns: Mapping[str, Vector], units: Mapping[str, str], title: str) -> Figure:
-    """Draw channels over time, one panel for each unit; angles in degrees."""
-    # Plots are a layer above signals, so that they are resolved by name.
-    return resolve("softneck.plots._chart:signals_figure")(time, columns, units, title)
