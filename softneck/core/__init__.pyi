@@ -50,6 +50,7 @@ from ._checks import finite_vector as finite_vector
 from ._content import compute_once as compute_once
 from ._content import content_digest as content_digest
 from ._display import ReprMixin as ReprMixin
+from ._display import bar_columns as bar_columns
 from ._display import percent as percent
 from ._display import shown_progress as shown_progress
 from ._errors import did_you_mean as did_you_mean

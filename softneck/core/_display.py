@@ -10,6 +10,7 @@ import textwrap
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
@@ -103,12 +104,34 @@ def shown_progress(what: str, given: Progress | None) -> Iterator[Progress]:
             bar.stop()
 
 
-def _bar() -> Any:
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+def bar_columns() -> tuple[Any, ...]:
+    """Return the columns of a bar: what is done, how much of it, the time so far and the time left."""
+    from rich.progress import BarColumn, ProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.text import Text
+
+    class TimeLeft(ProgressColumn):
+        def render(self, task: Any) -> Text:
+            return Text(time_left(task.completed, task.elapsed or 0.0))
 
     # No markup: a word may name a file, and `run[1].csv` is one.
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
-    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    return TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn(), TimeLeft()
+
+
+# The time left is said from this part done on: before it a start-up counts as much as the work.
+_LEAST_DONE = 0.05
+
+
+def time_left(done: float, elapsed: float) -> str:
+    """Return the time left [h:mm:ss] if the rest goes as quickly as the part `done` in `elapsed` s; "" too early."""
+    if not _LEAST_DONE <= done < 1.0 or elapsed < _DELAY_S:
+        return ""
+    return f"{timedelta(seconds=round(elapsed * (1.0 - done) / done))} left"
+
+
+def _bar() -> Any:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    bar = Progress(*bar_columns(), console=Console(stderr=True), transient=True)
     bar.start()
     return bar

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import (
+    KINDS,
     DataError,
     Progress,
     SettingsError,
@@ -40,7 +41,7 @@ from .models._fitting import check_training, payload_of
 from .models._model import Model
 from .models._validity import with_tolerance
 from .selection._auto import Choice, choose
-from .selection._examination import Examination, examine
+from .selection._examination import AGAIN, Examination, examine
 from .uncertainty._draws import make_draws
 from .uncertainty._family import Family
 from .uncertainty._family_fit import FamilySettings
@@ -186,14 +187,18 @@ def fit_and_validate(
         require_positive("tolerance", tolerance)
     head, tail = (whole, None) if train == 1.0 else whole.split(train)
     # A user's own kind may not report progress.
-    reported = {"progress": progress} if "progress" in signature(estimator.fit).parameters else {}
+    examined = tail is not None and any(isinstance(estimator, resolve(KINDS[kind].settings)) for kind in AGAIN)
+    half = 0.5 if examined else 1.0  # trainings without a part take about as long as that of all rows
+    fitting = lambda done, text: progress(half * done, text)  # noqa: E731
+    reported = {"progress": fitting} if "progress" in signature(estimator.fit).parameters else {}
     model: Model = estimator.fit(head, **reported)
     model = model if tolerance is None else with_tolerance(model, tolerance)
     if tail is None or all(len(run) < _MIN_HELD_OUT_ROWS for run in tail.runs()):
         return model, None
     examination = None
     if why_at_rest(tail, whole) is None:
-        examination, model = examine(estimator, model, head, tail, progress)
+        examining = lambda done, text: progress(half + (1.0 - half) * done, text)  # noqa: E731
+        examination, model = examine(estimator, model, head, tail, examining)
     held_out = validate(model, tail, horizons=(1, INFINITE))
     return with_fit(model, held_out, examination), held_out
 

@@ -183,11 +183,12 @@ def tune(
     with shown_progress("tune", progress) as tell:
         beside = min(core_count() - 1, _MOST_WORKERS) if workers is None else workers
         with open_workers(beside, None) if beside else contextlib.nullcontext() as pool:
-            search = Search(task, each, pool, log, budget, lambda done, text: tell(0.9 * done, text))
+            search = Search(task, each, pool, log, budget, lambda done, text: tell(0.75 * done, text))
             search.dropped |= dropped
             search.run()
-            search, certified, tried = certify_search(search, files, lambda done, text: tell(0.9 + 0.1 * done, text))
-        return _make_result(search, certified, tried, files, lambda done, text: tell(0.9 + 0.1 * done, text))
+            late = lambda done, text: tell(0.75 + 0.25 * done, text)  # noqa: E731
+            search, certified, tried = certify_search(search, files, late)
+        return _make_result(search, certified, tried, files, late)
 
 
 def task_of(plants: Any, requirements: TuneRequirements | Mapping[str, Any] | str | Path | None, seed: int) -> Task:

@@ -115,7 +115,8 @@ def gather(
         return _linear_evidence(controller, necks, asked, progress, families)
 
     def simulated() -> tuple[list[LoopRun], list[Crossing]]:
-        return _simulated(controller, asked, observer=observer, progress=progress, own=own, overall=overall)
+        loops = lambda done, text: progress(0.5 + (0.1 if drawn else 0.5) * done, text)  # noqa: E731
+        return _simulated(controller, asked, observer=observer, progress=loops, own=own, overall=overall)
 
     found = compute_once(linear, controller, necks, asked.tables, families)
     if own:
@@ -131,7 +132,7 @@ def gather(
     why = why_no_virtual_plant(controller.robot, asked)
     evidence.not_computed.update({"sim": why} if why and not own else judged_elsewhere(own, asked))
     _fill_metrics(evidence, controller, asked, observer is not None)
-    late = lambda done, text: progress(0.8 + 0.2 * done, text)  # noqa: E731
+    late = lambda done, text: progress(0.6 + 0.4 * done, text)  # noqa: E731
     for name, draws in drawn.items():
         evidence.drawn.append(run_drawn(
             name, draws, controller.block, asked, order=controller.order, observer=observer, attempt=attempt,
@@ -157,9 +158,9 @@ def _linear_evidence(
     w = frequency_grid(base.sample_time, asked.scale.time)
     linear = []
     for number, (name, law) in enumerate(controller.laws.items()):
-        progress(0.5 * number / len(controller.laws), "margins" + (f" at {name}" if name else ""))
+        progress(0.4 * number / len(controller.laws), "margins" + (f" at {name}" if name else ""))
         linear.append(_linear(name, law, plants, sources, controller.extra, asked))
-    progress(0.5, "steps against every plant")
+    progress(0.4, "steps against every plant")
     stepped = join([plants, *(part.plants.take(np.arange(len(plants), len(part.plants))) for part in linear)])
     test, weights = asked.step_test(seed), sources[0].weights
     steps = run_steps(stepped, controller.block, test, robot=controller.robot, weights=weights)
@@ -177,10 +178,10 @@ def _simulated(
     seed = int(asked.sampling["seed"])
     runs = run_loops(
         controller.block, asked, order=controller.order, observer=observer, seed=seed,
-        progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
+        progress=lambda done, text: progress(0.5 * done, text), own=own,
     )  # fmt: skip
     loops = loops_under_test(controller.block, own, asked, order=controller.order, observer=observer)
-    late = lambda done, text: progress(0.8 + 0.2 * done, text)  # noqa: E731
+    late = lambda done, text: progress(0.5 + 0.5 * done, text)  # noqa: E731
     return runs, crossings(loops, overall=overall, progress=late) if loops else []
 
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from softneck.core import silent
-from softneck.core._display import shown_progress
+from softneck.core._display import shown_progress, time_left
 
 
 class Terminal(io.StringIO):
@@ -38,6 +38,15 @@ def test_what_takes_long_has_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     with shown_progress("identify nn", None) as tell:
         tell(0.5, "run[1].csv")
     assert "identify nn: run[1].csv" in terminal.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("done", "elapsed", "said"),
+    [(0.5, 10.0, "0:00:10 left"), (0.25, 1800.0, "1:30:00 left"), (0.75, 300.0, "0:01:40 left"), (1.0, 10.0, ""),
+     (0.05, 10.0, "0:03:10 left"), (0.04, 10.0, ""), (0.5, 2.0, "0:00:02 left"), (0.5, 1.9, "")],
+)  # fmt: skip
+def test_the_rest_takes_as_long_for_each_part_as_what_is_done(done: float, elapsed: float, said: str) -> None:
+    assert time_left(done, elapsed) == said
 
 
 @pytest.mark.parametrize("off", ["no terminal", "variable", "silent"])

@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from softneck import identification
-from softneck.core import Progress, silent
+from softneck.core import Progress, bar_columns, silent
 from softneck.core import Progress as ProgressCallback
 from softneck.core import percent as percent
 
@@ -59,16 +59,14 @@ def progress(what: str, *, quiet: bool = False) -> Iterator[ProgressCallback]:
         yield silent
         return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress, SpinnerColumn
 
     console = Console(stderr=True)
     if not console.is_terminal:
         note(f"{what} ...")
         yield silent
         return
-    # No markup: a description names files, and `run[1].csv` is one.
-    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(SpinnerColumn(), *bar_columns(), console=console, transient=True) as bar:
         task = bar.add_task(what, total=1.0)
         yield lambda done, word: bar.update(task, completed=done, description=f"{what}: {word}")
 

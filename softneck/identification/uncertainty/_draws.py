@@ -223,11 +223,11 @@ def make_draws(
     whole = concatenate(recordings)
     second = ScaledData.of(whole).scaling.second
     train, held, warm_ups = _split(whole, second)
-    sources = _sources(train, lambda done, text: progress(0.7 * done, f"draws: {text}"))
+    sources = _sources(train, lambda done, text: progress(0.4 * done, f"draws: {text}"))
     motions = _Motions.of(held, sources[0].model, second, warm_ups)
     memory, tried = second / held.sample_time, list[tuple[Vector, Source, float, np.ndarray]]()
     for number, (source, factor) in enumerate(product(sources, _FACTORS)):
-        progress(0.7 + 0.15 * number / (len(sources) * len(_FACTORS)), f"draws: deviations times {factor:g}")
+        progress(0.4 + 0.35 * number / (len(sources) * len(_FACTORS)), f"draws: deviations times {factor:g}")
         rng = np.random.default_rng([seed, 0])
         trial = [source.draw(rng) for _ in range(_CALIBRATION_DRAWS)]
         Y = replace(motions, model=source.model).simulate(_arrays(source, factor, trial))
@@ -241,7 +241,7 @@ def make_draws(
     more = next((more for more in _MORE if motions.covers(Y, more * share, keep)), _MORE[-1])
     rows, rng, sizes = list[dict[str, Matrix]](), np.random.default_rng([seed, 1]), [SEARCH_DRAWS, *[count] * ATTEMPTS]
     for number, size in enumerate(sizes):
-        progress(0.85 + 0.15 * number / len(sizes), "draws")
+        progress(0.75 + 0.25 * number / len(sizes), "draws")
         rows += _arrays(source, factor, [source.draw(rng) for _ in range(size)])
     made = merge_conditions([conditions(part) for part in recordings])
     return Draws(

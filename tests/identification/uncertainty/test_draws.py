@@ -571,7 +571,7 @@ def test_the_making_of_draws_says_how_far_it_is_and_refuses_what_has_no_simulati
     monkeypatch.setattr(_draws, "_FACTORS", (1.0, 2.0))
     monkeypatch.setattr(_draws, "_CALIBRATION_DRAWS", 4)
     make_draws(recordings, count=2, progress=lambda share, _: said.append(share))
-    assert said == pytest.approx([0.0, 0.7, 0.7, 0.775, *(0.85 + 0.15 * np.arange(6) / 6)])
+    assert said == pytest.approx([0.0, 0.4, 0.4, 0.575, *(0.75 + 0.25 * np.arange(6) / 6)])
     monkeypatch.setattr(_draws._Motions, "simulate", lambda own, _: np.full((4, *own.outputs.shape), np.nan))
     with pytest.raises(DataError, match="no draw has a finite simulation"):
         make_draws(recordings, count=2)
