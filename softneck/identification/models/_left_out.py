@@ -68,16 +68,17 @@ def weighted_median(values: np.ndarray, weights: Vector) -> Matrix:
     return np.take_along_axis(np.take_along_axis(values, order, axis=0), first[None], axis=0)[0]
 
 
-# Kinds are compared on so many rows (40 s of Eq. 22); the chosen one is trained on all.
-SCREENED_ROWS = 2000
+# Kinds are compared on so many rows (40 s of Eq. 22) or time constants, whichever are more; the chosen one is trained
+# on all.
+SCREENED_ROWS, _SCREENED = 2000, 50.0
 # Part of the rows that each region takes, and how far it reaches into what lies before and after [time constants].
 _REGION, _WIDEN = 0.12, 1.0
 # Sizes of one level differ by less: a mean of them is rounded in another way on each kind of processor.
 _ROUNDING = 1e-9
 # Over how long a motion is fast or slow [time constants].
 _MOVED_OVER = 2.5
-# Runs are left out in so many groups at most; a group of fewer rows says nothing of a simulation.
-_MOST_GROUPS, _LEAST_ROWS = 3, 10 * WARM_UP
+# Runs are left out in so many groups at most; a group of fewer rows or time constants says nothing of a simulation.
+_MOST_GROUPS, _LEAST_ROWS, _LEAST = 3, 10 * WARM_UP, 10.0
 # Kinds of set-points: held between jumps, or moving all the time.
 JUMPS, SMOOTH = "jumps", "smooth motions"
 # Of a motor's range: set-points that change by less from one row to the next are held.
@@ -127,35 +128,42 @@ def folds(train: Recording, hold_out: Recording, *, other_excitation: bool) -> l
 
     `hold_out` is shown only to those that leave `train` out; `other_excitation`: it is another experiment.
     """
-    head, tail = _first_rows(train)
     seconds = time_constant_of(train)
-    blanked, judged = (head, []) if seconds is None else _blank_extreme_motions(head, seconds / train.sample_time)
+    slow = 0.0 if seconds is None else seconds / train.sample_time
+    head, tail = _first_rows(train, slow)
+    blanked, judged = _blank_extreme_motions(head, slow) if slow else (head, [])
     if tail is not None:
         judged.append(all_rows("later block", tail))
     if other_excitation:
         judged.append(all_rows("other excitation", hold_out))
     found = [Fold(blanked, tuple(judged))] if judged else []
-    for number, (group, others) in enumerate(_groups(train), start=1):
-        found.append(Fold(_first_rows(others)[0], (all_rows(f"excitation {number}", group),)))
+    for number, (group, others) in enumerate(_groups(train, slow), start=1):
+        found.append(Fold(_first_rows(others, slow)[0], (all_rows(f"excitation {number}", group),)))
     if len(train.runs()) == 1 and (phases := _by_phase(train)):
         for name, others in ((JUMPS, SMOOTH), (SMOOTH, JUMPS)):
-            found.append(Fold(_first_rows(phases[others])[0], (all_rows(name, phases[name]),)))
+            found.append(Fold(_first_rows(phases[others], slow)[0], (all_rows(name, phases[name]),)))
     if other_excitation and len(hold_out) >= _LEAST_ROWS:
-        found.append(Fold(_first_rows(hold_out)[0], (all_rows("trained on the other", head),)))
+        found.append(Fold(_first_rows(hold_out, slow)[0], (all_rows("trained on the other", head),)))
     return found
 
 
-def _first_rows(recording: Recording) -> tuple[Recording, Recording | None]:
-    """Return the first `SCREENED_ROWS` rows over all runs, and the rest; None if the rest is too short."""
-    share = SCREENED_ROWS / len(recording)
+def _first_rows(recording: Recording, slow: float) -> tuple[Recording, Recording | None]:
+    """Return the first `SCREENED_ROWS` rows over all runs, or more, and the rest; None if the rest is too short.
+
+    `slow` is the robot's time constant [samples].
+    """
+    share = max(SCREENED_ROWS, _SCREENED * slow) / len(recording)
     if share >= 1.0:
         return recording, None
     head, tail = recording.split(share)
-    return head, tail if any(len(run) >= _LEAST_ROWS for run in tail.runs()) else None
+    return head, tail if any(len(run) >= max(_LEAST_ROWS, _LEAST * slow) for run in tail.runs()) else None
 
 
-def _groups(train: Recording) -> list[tuple[Recording, Recording]]:
-    """Return groups of runs that follow each other, each with all the others; none of a single run."""
+def _groups(train: Recording, slow: float) -> list[tuple[Recording, Recording]]:
+    """Return groups of runs that follow each other, each with all the others; none of a single run.
+
+    `slow` is the robot's time constant [samples].
+    """
     runs = train.runs()
     if len(runs) < 2:
         return []
@@ -163,7 +171,7 @@ def _groups(train: Recording) -> list[tuple[Recording, Recording]]:
     found = []
     for start, stop in itertools.pairwise(edges):
         group, others = list(runs[start:stop]), [*runs[:start], *runs[stop:]]
-        if min(sum(map(len, part)) for part in (group, others)) >= _LEAST_ROWS:
+        if min(sum(map(len, part)) for part in (group, others)) >= max(_LEAST_ROWS, _LEAST * slow):
             found.append((concatenate(group), concatenate(others)))
     return found
 
@@ -229,7 +237,7 @@ def _blank_extreme_motions(recording: Recording, slow: float) -> tuple[Recording
     far, fast = (_largest_rows(recording, size, reach) for size in (_sizes(recording), _speeds(recording, span)))
     rest = ~(far | fast)
     Y = np.where(rest[:, None], recording.outputs, np.nan)
-    if np.isfinite(Y).sum(axis=0).min() < 2 * MIN_ROWS:
+    if np.isfinite(Y).sum(axis=0).min() < max(2 * MIN_ROWS, _LEAST * slow):
         return recording, []
     scored = _scored_rows(recording)
     judged = [Judged("largest motions", recording, far & scored), Judged("fastest motions", recording, fast & scored)]

@@ -14,13 +14,14 @@ import pytest
 from softneck.core import DataError, silent
 from softneck.identification import Model, Play, SetMembership, identify, with_tolerance
 from softneck.identification.models import _left_out
-from softneck.identification.models._left_out import Judged, folds, motions_held_out, standard_error
+from softneck.identification.models._left_out import Fold, Judged, folds, motions_held_out, standard_error
 from softneck.identification.models._scores import nrmse_fit
 from softneck.identification.models._validity import calibrate_validity, tolerance_of
 from softneck.identification.selection._examination import (
     Examination,
     examine,
     other_motion,
+    second_training,
     shortened,
     unseen_rows,
 )
@@ -227,7 +228,9 @@ def test_a_speed_is_the_change_around_each_row_within_its_run(span: int) -> None
     np.testing.assert_allclose(_left_out._speeds(recording, span), expected, rtol=1e-12)
 
 
-def test_extreme_motions_are_blanked_as_long_as_two_hundred_rows_of_each_output_are_left() -> None:
+def test_extreme_motions_are_blanked_as_long_as_two_hundred_rows_of_each_output_are_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     recording = neck_recording(600)
     slow = 5.4
     far = _left_out._largest_rows(recording, _left_out._sizes(recording), 5)
@@ -241,51 +244,101 @@ def test_extreme_motions_are_blanked_as_long_as_two_hundred_rows_of_each_output_
     for part, name, rows in zip(judged, ("largest motions", "fastest motions"), (far, fast), strict=True):
         assert (part.name, part.recording) == (name, recording)
         np.testing.assert_array_equal(part.rows, rows & scored)
-    # 200 samples of the output with the fewest are enough, and 199 are not.
+    # 200 samples of the output with the fewest are enough, and 199 are not; nor are fewer than some time constants.
     kept = np.flatnonzero(~(far | fast))
-    for wanted in (200, 199):
+    for wanted, least in ((200, 10.0), (199, 10.0), (216, 40.0), (215, 40.0)):
+        monkeypatch.setattr(_left_out, "_LEAST", least)
         y = recording.outputs.copy()
         y[kept[wanted:], 1] = np.nan
         found, parts = _left_out._blank_extreme_motions(recording.with_channels(roll=y[:, 1]), slow)
-        assert len(parts) == (2 if wanted == 200 else 0)
+        assert len(parts) == (2 if wanted in (200, 216) else 0)
         assert np.isnan(found.outputs[:, 0]).any() == bool(parts)
     # A robot that is quicker than a sample moves over one sample at least.
     assert _left_out._blank_extreme_motions(recording, 0.01)[1][1].name == "fastest motions"
 
 
 @pytest.mark.parametrize(
-    ("lengths", "head", "tail"),
-    [([2000], 2000, None), ([2240], 2000, None), ([2250], 2000, 250), ([1500, 1500], 2000, 1000),
-     ([1000, 1000, 300], None, None)],
+    ("lengths", "slow", "head", "tail"),
+    [([2000], 10.0, 2000, None), ([2240], 10.0, 2000, None), ([2250], 10.0, 2000, 250),
+     ([1500, 1500], 10.0, 2000, 1000), ([1000, 1000, 300], 10.0, None, None),
+     # Of fast samples 50 time constants, and a rest of 10.
+     ([3600], 60.0, 3000, 600), ([3599], 60.0, 3000, None), ([2250], 40.0, 2000, None)],
 )  # fmt: skip
 def test_the_first_two_thousand_rows_are_screened_and_a_rest_of_ten_warm_ups_is_the_later_block(
-    lengths: list[int], head: int | None, tail: int | None
+    lengths: list[int], slow: float, head: int | None, tail: int | None
 ) -> None:
     U = np.random.default_rng(2).standard_normal((sum(lengths), 3))
-    first, rest = _left_out._first_rows(of_runs(lengths, U))
+    first, rest = _left_out._first_rows(of_runs(lengths, U), slow)
     assert (None if rest is None else len(rest)) == tail
     if head is not None:
         assert len(first) == head
 
 
 @pytest.mark.parametrize(
-    ("lengths", "groups"),
-    [([900], []), ([300, 300], [[0], [1]]), ([300, 300, 300], [[0], [1], [2]]), ([300] * 4, [[0], [1, 2], [3]]),
-     ([300] * 6, [[0, 1], [2, 3], [4, 5]]), ([300, 249, 300], [[0], [2]]), ([300, 250], [[0], [1]]),
-     ([300, 249], []), ([249, 250, 249], [[0], [1], [2]][1:2])],
+    ("lengths", "slow", "groups"),
+    [([900], 10.0, []), ([300, 300], 10.0, [[0], [1]]), ([300, 300, 300], 10.0, [[0], [1], [2]]),
+     ([300] * 4, 10.0, [[0], [1, 2], [3]]), ([300] * 6, 10.0, [[0, 1], [2, 3], [4, 5]]),
+     ([300, 249, 300], 10.0, [[0], [2]]), ([300, 250], 10.0, [[0], [1]]), ([300, 249], 10.0, []),
+     ([249, 250, 249], 10.0, [[1]]), ([300, 300], 30.0, [[0], [1]]), ([300, 300], 30.1, [])],
 )  # fmt: skip
 def test_runs_are_left_out_in_at_most_three_groups_of_ten_warm_ups_or_more(
-    lengths: list[int], groups: list[list[int]]
+    lengths: list[int], slow: float, groups: list[list[int]]
 ) -> None:
     U = np.random.default_rng(3).standard_normal((sum(lengths), 3))
     recording = of_runs(lengths, U)
     runs = recording.runs()
-    found = _left_out._groups(recording)
+    found = _left_out._groups(recording, slow)
     assert len(found) == len(groups)
     for (group, others), numbers in zip(found, groups, strict=True):
         rest = [k for k in range(len(runs)) if k not in numbers]
         for part, own in ((group, numbers), (others, rest)):
             np.testing.assert_array_equal(part.set_points, np.concatenate([runs[k].set_points for k in own]))
+
+
+VALVE = Robot.from_dict({
+    "name": "valve", "motors": {"names": ["valve"], "unit": "kPa", "setpoint_min": 0.0, "setpoint_max": 100.0},
+    "outputs": {"names": ["tip"], "unit": "mm"}, "directions": {"kind": "identified"},
+})  # fmt: skip
+
+
+def lag(samples: int, rows: int, seed: int) -> Recording:
+    """A lag of first order under levels at random, sampled so often in its time constant at 1 ms."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(0.0, 1e5, rows // (3 * samples // 2) + 1), 3 * samples // 2)[:rows]
+    y, pole = np.full(rows, 2e-7 * u[0]), np.exp(-1.0 / samples)
+    for k in range(rows - 1):
+        y[k + 1] = pole * y[k] + (1.0 - pole) * 2e-7 * u[k]
+    noisy = y + 6e-4 * rng.standard_normal(rows)
+    return Recording(1e-3 * np.arange(rows), 1e-3, {"valve_setpoint": u, "tip": noisy}, robot=VALVE)
+
+
+def test_of_fast_samples_time_constants_are_left_out_not_rows() -> None:
+    """2,000 rows of 1 ms are 5 time constants of 0.4 s: what is trained on them says nothing of the kind."""
+    model = identify("oe", lag(400, 20_000, 0))
+    parts = model.findings["examination"]["parts"]
+    assert {"largest motions", "fastest motions"} <= parts.keys()
+    other = lag(400, 20_000, 1)
+    truth = nrmse_fit(other.outputs[:, 0], np.asarray(model.simulate(other))[:, 0])
+    # Noise is a sixth to a tenth of what each part moves by, for each a little more or less than for all.
+    assert model.findings["examination"]["fit"] == pytest.approx(truth, abs=5.0)
+
+
+def test_two_trainings_that_err_alike_say_how_far_either_is_from_the_truth() -> None:
+    recording, rng = neck_recording(600), np.random.default_rng(8)
+
+    def erring(share: float) -> Any:
+        def simulate(motion: Recording, warm_up: int) -> np.ndarray:
+            assert warm_up == 1
+            y = motion.set_points[:, :2]
+            return y + share * y.std(axis=0) * rng.standard_normal(y.shape)
+
+        return SimpleNamespace(robot=recording.robot, simulate=simulate)
+
+    fits = second_training(erring(0.2), erring(0.2), Fold(recording, ()))
+    # 80 % each; 1,500 samples tell a spread to 2 %, and the first model's error is a part of its own spread.
+    assert fits == {"pitch": pytest.approx(80.0, abs=1.0), "roll": pytest.approx(80.0, abs=1.0)}
+    lost = second_training(erring(0.2), erring(math.nan), Fold(recording, ()))
+    assert lost == dict.fromkeys(("pitch", "roll"), -math.inf)
 
 
 @pytest.mark.parametrize("other", [True, False])
