@@ -190,7 +190,7 @@ def test_a_search_aims_at_the_cocontraction_of_the_recordings_in_four_digits(mon
 
 
 def test_a_tuning_says_how_far_it_is_from_nothing_to_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nine tenths are the search, the rest its certificates; its result is of what they end with."""
+    """Three quarters are the search, the rest its certificates; its result is of what they end with."""
     said: list[float] = []
 
     def course(*given: Any) -> None:
@@ -205,7 +205,7 @@ def test_a_tuning_says_how_far_it_is_from_nothing_to_all(monkeypatch: pytest.Mon
     found = tune({"n": linear_neck()}, {}, kinds="pi", workers=0, files={"f": ("a", "b")},
                  progress=lambda share, _: said.append(share))  # fmt: skip
     assert found == ("search", "best", 3, {"f": ("a", "b")})
-    assert said == pytest.approx([0.0, 0.45, 0.9, *[0.9, 0.95, 1.0] * 2])
+    assert said == pytest.approx([0.0, 0.375, 0.75, *[0.75, 0.875, 1.0] * 2])
 
 
 @pytest.mark.parametrize("attempts", [[], [2], [2, 5], [5, 2], [100], [100, 7]])

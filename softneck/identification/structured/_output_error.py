@@ -216,7 +216,7 @@ class FitProblem:
         return compute_once(lambda: self._delayed(delay, evaluations, tell), self, delay, evaluations)
 
     def coarse(self) -> FitProblem:
-        """Return the problem with longer substeps, to begin a search or to compare bodies."""
+        """Return the problem with longer substeps, to begin a search."""
         return replace(self, substeps=_COARSE_SUBSTEPS)
 
     def _delayed(self, delay: int | None, evaluations: int, tell: SearchProgress) -> Found:

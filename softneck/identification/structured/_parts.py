@@ -167,7 +167,7 @@ def _trial(found: Found, scaled: ScaledData, fold: Fold, evaluations: int, tell:
     def problem_of(recording: Recording) -> FitProblem:
         whole = found.problem
         own = FitProblem.of(replace(scaled, data=recording), whole.drive_delays)
-        return replace(own.coarse(), numbers=whole.numbers, payload_range=whole.payload_range, reach=whole.reach)
+        return replace(own, numbers=whole.numbers, payload_range=whole.payload_range, reach=whole.reach)
 
     problem = problem_of(fold.train)
     return _Trial(
