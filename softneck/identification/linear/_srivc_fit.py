@@ -209,7 +209,7 @@ class _Discrete:
         big[3 * n - 1, n] += 1.0
         drive[:n] = e
         late, old, new, transition = _discretize_zoh(big, drive, model.delay, sample_time)
-        free = _free_responses(transition[:n, :n], longest)
+        free = _free_responses(transition[:n, :n].copy(), longest)
         return cls(model, transition, old, new, late, _discretize_foh(A, e, sample_time), C, C @ A, free)
 
 
@@ -273,9 +273,7 @@ def _free_responses(Ad: Matrix, size: int) -> Matrix:
     n = len(Ad)
     rows, states, zero = np.zeros((size, n)), np.zeros((size, n)), np.zeros(n)
     for i in range(n):
-        load_functions(_CT_RUNTIME).ct_simulate(
-            np.ascontiguousarray(Ad), zero, zero, np.zeros(size), 0, np.eye(n)[i], states
-        )
+        load_functions(_CT_RUNTIME).ct_simulate(Ad, zero, zero, np.zeros(size), 0, np.eye(n)[i], states)
         rows[:, i] = states[:, 0]
     return rows
 
