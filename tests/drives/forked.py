@@ -15,12 +15,10 @@ from typing import IO
 IMPORTED = ["softneck.cli", "softneck.drives", "softneck.cosim", "can.interfaces.socketcan", "warmed"]
 
 
-def _run(words: tuple[str, ...], environment: dict[str, str], first: int, out: Connection, error: Connection) -> None:
+def _run(words: tuple[str, ...], environment: dict[str, str], out: Connection, error: Connection) -> None:
     """Be `python WORDS`, with -m or with the command line's -c."""
     os.environ.clear()
     os.environ.update(environment)
-    if first:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(first))
     os.dup2(out.fileno(), 1)
     os.dup2(error.fileno(), 2)
     if words[0] == "-m":
@@ -42,12 +40,12 @@ def imports_in(project: Path) -> None:
 class Forked:
     """What `subprocess.Popen(..., stdout=PIPE, stderr=PIPE)` offers, as far as `processes.py` uses it."""
 
-    def __init__(self, words: tuple[str, ...], *, first: int = 0) -> None:
-        """Start `python WORDS`; `first`: its priority before all ordinary processes."""
+    def __init__(self, words: tuple[str, ...]) -> None:
+        """Start `python WORDS`."""
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(IMPORTED)
         pairs = [context.Pipe(duplex=False) for _ in range(2)]
-        given = (words, dict(os.environ), first, pairs[0][1], pairs[1][1])
+        given = (words, dict(os.environ), pairs[0][1], pairs[1][1])
         self.process = context.Process(target=_run, args=given, daemon=True)
         self.process.start()
         for _, writer in pairs:

@@ -60,6 +60,7 @@ class World:
     changes: list[dict[str, Any]] = field(default_factory=list)
     told: list[str] = field(default_factory=list)
     children: list[Any] = field(default_factory=list)
+    longest_step: float = 0.0
 
     def start(self, loop: str = "loop") -> None:
         """Start all three and wait until the controller runs."""
@@ -69,6 +70,7 @@ class World:
         )  # fmt: skip
         threading.Thread(target=self._read, daemon=True).start()
         self.wait(lambda: len(self.changes) >= 3, "the drives", 60.0)
+        self._first(self.drives, 41)
         self.notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         address = self.folder / "notify.socket"
         self.notify.bind(str(address))
@@ -80,15 +82,18 @@ class World:
         finally:
             for name in ("NOTIFY_SOCKET", "WATCHDOG_USEC"):
                 del os.environ[name]
-        self.wait(lambda: "STATUS=running" in self.told or self.host.poll() is not None, "the loop", 60.0)
-        if self.host.poll() is not None:
-            code, result, line = self.ended()
-            # Drives are guarded within 0.1 s: the host may meet their emergency before it sees that it stood still.
-            longest = result.get("longest_step_s", 0.0)
-            stood = f": a step stood still for {longest:.3f} s" if longest > 0.1 else ""
-            raise RuntimeError(f"the host ended before its case with {code}: {line}{stood}; {result}")
+        self.until(lambda: "READY=1" in self.told, "the checks", 60.0)
+        self._first(self.host, 40)
+        self.until(lambda: "STATUS=running" in self.told, "the loop", 60.0)
 
-    def run(self, loop: str, *, arm: bool = True, realtime: bool = True) -> Any:
+    def until(self, done: Callable[[], bool], what: str, seconds: float) -> None:
+        """Wait until `done`; raise if the host ends before."""
+        self.wait(lambda: done() or self.host.poll() is not None, what, seconds)
+        if not done():
+            code, result, line = self.ended()
+            raise RuntimeError(f"the host ended before {what} with {code}: {line}; {result}")
+
+    def run(self, loop: str, *, arm: bool = True) -> Any:
         """Start `softneck drives run`."""
         code = "from softneck.cli import main; main()"
         files = {"--loop": f"{loop}.toml", "--drives": "drives.toml", "-o": f"run_{time.monotonic_ns()}.csv"}
@@ -98,22 +103,28 @@ class World:
         words += ["--override", "certificate", *self.extra]
         for option, name in files.items():
             words += [option, str(self.folder / name)]
-        return self._spawn("-c", code, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, first=40 * realtime)
+        return self._spawn("-c", code, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
     def command(self, words: list[str]) -> Any:
         """Start another `softneck` command."""
         code = "from softneck.cli import main; main()"
-        return self._spawn("-c", code, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, first=0)
+        return self._spawn("-c", code, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
-    def _spawn(
-        self, *arguments: str, stdout: int = subprocess.DEVNULL, stderr: int = subprocess.DEVNULL, first: int = 41
-    ) -> Any:
-        """Start a process; above the loop the simulated drives, which stand for hardware that no process holds up."""
-        first *= self.realtime
+    def _first(self, child: Any, priority: int) -> None:
+        """Let a process go before all ordinary ones from now on: while it imported, it would hold other loops up.
+
+        Above the loop stand the simulated drives, for hardware that no process holds up.
+        """
+        if self.realtime and child.poll() is None:
+            for task in Path(f"/proc/{child.pid}/task").iterdir():
+                os.sched_setscheduler(int(task.name), os.SCHED_FIFO, os.sched_param(priority))
+
+    def _spawn(self, *arguments: str, stdout: int = subprocess.DEVNULL, stderr: int = subprocess.DEVNULL) -> Any:
+        """Start a process."""
         if self.forking:
-            self.children.append(Forked(arguments, first=first))
+            self.children.append(Forked(arguments))
             return self.children[-1]
-        command = [*(["chrt", "-f", str(first)] if first else []), sys.executable, *arguments]
+        command = [sys.executable, *arguments]
         child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr)
         self.children.append(child)
         return child
@@ -162,8 +173,9 @@ class World:
         """Wait for a host; return exit code, JSON, last line on stderr."""
         child = child or self.host
         out, error = child.communicate(timeout=seconds * self.patience)
-        lines = error.decode().strip().splitlines()
-        return child.returncode, json.loads(out) if out.strip() else {}, lines[-1] if lines else ""
+        lines, result = error.decode().strip().splitlines(), json.loads(out) if out.strip() else {}
+        self.longest_step = max(self.longest_step, result.get("longest_step_s", 0.0))
+        return child.returncode, result, lines[-1] if lines else ""
 
     def close(self) -> None:
         """End what this world started."""
@@ -208,7 +220,7 @@ def paused(world: World) -> dict[str, Any]:
 
 def hung(world: World) -> dict[str, Any]:
     """A part of the controller never returns."""
-    world.wait((world.folder / "hung").exists, "the hang", 20.0)
+    world.until((world.folder / "hung").exists, "the hang", 20.0)
     time.sleep(0.01)
     since = float((world.folder / "hung").read_text())
     world.wait(lambda: world.all(FAULT), "Fault", 5.0)
@@ -222,8 +234,7 @@ def hung(world: World) -> dict[str, Any]:
 def second_master(world: World) -> dict[str, Any]:
     """Another `softneck drives run` is refused, and the first one goes on."""
     since = time.monotonic()
-    # Of equal priority it would hold the first one up where there is one processor only.
-    code, _, line = world.ended(world.run("short", realtime=False), seconds=60.0)
+    code, _, line = world.ended(world.run("short"), seconds=60.0)
     went_on = world.all("ENABLED")
     world.host.terminate()
     first, result, _ = world.ended()
@@ -241,10 +252,10 @@ def second_master(world: World) -> dict[str, Any]:
 def unarmed(world: World) -> dict[str, Any]:
     """Without --arm, without the words, with another bus' words: refused; the running master sees no frame of them."""
     words = os.environ.pop(ARM)
-    refused = [world.ended(world.run("short", arm=False, realtime=False), seconds=60.0)]
-    refused.append(world.ended(world.run("short", realtime=False), seconds=60.0))
+    refused = [world.ended(world.run("short", arm=False), seconds=60.0)]
+    refused.append(world.ended(world.run("short"), seconds=60.0))
     os.environ[ARM] = f"{words}0"
-    refused.append(world.ended(world.run("short", realtime=False), seconds=60.0))
+    refused.append(world.ended(world.run("short"), seconds=60.0))
     went_on = world.all("ENABLED")
     world.host.terminate()
     code, _, _ = world.ended()
@@ -524,7 +535,7 @@ def main() -> None:
                 world.realtime, world.drives_bus = chosen.realtime, chosen.drives_bus
                 world.forking, world.profile = chosen.fork, chosen.profile
                 found = play(case, world)
-                if not too_busy(found) or attempt == chosen.attempts - 1:
+                if not too_busy(found, world.longest_step, chosen.guarding) or attempt == chosen.attempts - 1:
                     break
             print(json.dumps(found), flush=True)
 
