@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from softneck.core import DataError, Matrix, ReprMixin, SettingsError, Vector
-from softneck.runtime import load_functions, sized_name
+from softneck.runtime import load_around_step, load_functions, load_runtime, sized_name
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver
@@ -18,6 +18,7 @@ from ._offline import check_recording, input_rows, measured_angles, measured_nam
 
 # Rows at the start of each run that are not scored: the filter has not converged there.
 SETTLE = 50
+_LIKELIHOOD = "softneck.estimation._likelihood_runtime"
 # An outlier is further than this from the median of itself and its two neighbours [robust standard deviations].
 _OUTLIER_DEVIATIONS = 6.0
 # Levels are searched within two decades of the start: smooth data would drive them to zero, and a filter without noise
@@ -140,7 +141,8 @@ class Cost:
 
     def __init__(self, observer: KalmanObserver, runs: Sequence[Recording]) -> None:
         motors, outputs = len(observer.robot.motors.names), len(observer.robot.outputs.names)
-        self._functions = load_functions(sized_name("softneck.estimation._likelihood_runtime", motors, outputs))
+        runtime = observer.block().runtime
+        self._cost = load_around_step(sized_name(_LIKELIHOOD, motors, outputs), "kalman_cost", runtime)
         self._told = 2 * outputs + 2
         arrays = dict(zip(KalmanArrays.names(), observer.arrays, strict=False))  # without steady gains
         arrays["constants"] = constants = arrays["constants"].copy()
@@ -148,7 +150,8 @@ class Cost:
         constants[KALMAN_GATE] = constants[KALMAN_REJECTIONS] = np.inf
         constants[KALMAN_FROZEN] = 0.0
         self._arrays = tuple(arrays.values())
-        self._size = int(self._functions.state_size(self._arrays))
+        self._runtime = load_runtime(runtime)
+        self._size = int(self._runtime.state_size(self._arrays))
         self._tables: list[Matrix] = []
         self.outliers = 0
         for run in runs:
@@ -164,8 +167,8 @@ class Cost:
 
     def _run(self, table: Matrix, noise: Sequence[float]) -> tuple[float, int]:
         state, outputs, parameters = np.zeros(self._size), np.zeros(self._told), np.array(noise)
-        self._functions.initialise(self._arrays, parameters, state, outputs)
-        return self._functions.kalman_cost(self._arrays, parameters, state, table, SETTLE)
+        self._runtime.initialise(self._arrays, parameters, state, outputs)
+        return self._cost(self._arrays, parameters, state, table, SETTLE)
 
 
 def _measurements_without_outliers(run: Recording) -> tuple[Matrix, int]:
@@ -180,7 +183,7 @@ class WalkCost:
     """The cost over a nonlinear model: it is simulated once, and its error is a random walk."""
 
     def __init__(self, observer: NonlinearObserver, runs: Sequence[Recording]) -> None:
-        self._cost = load_functions("softneck.estimation._likelihood_runtime").walk_cost
+        self._cost = load_functions(_LIKELIHOOD).walk_cost
         self._start = observer.walk_start
         self._tables: list[tuple[Matrix, Matrix, Vector]] = []
         self.outliers = 0

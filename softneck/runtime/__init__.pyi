@@ -18,6 +18,7 @@ from ._compile import COMPILE_OPTIONS as COMPILE_OPTIONS
 from ._compile import cache_folder as cache_folder
 from ._compile import compiled_name as compiled_name
 from ._compile import have_numba as have_numba
+from ._compile import load_around_step as load_around_step
 from ._compile import load_linked as load_linked
 from ._compile import load_tangent as load_tangent
 from ._numba_cache import compile_without_failing_cache as compile_without_failing_cache

@@ -132,10 +132,26 @@ def _link_parts(module: str, called: str, runtimes: tuple[str, ...]) -> Callable
         step = f"linked_{i}(parts[0][{i}], parts[1][{i}], parts[2][{i}], inputs, outputs)"
         lines += [f"    if part == {i}:", f"        {step}"]
     lines.append("    return False")  # no part has this index
-    text = bundle(module, loops=False, skip=("part_step",)) + "\n".join(lines) + "\n"
-    namespace = _import_text(text, compiled=True)
     # Counting references to the arrays of all parts at each call took longer than a light step; rows allocate nothing.
-    _compile(namespace, (called,), {"_nrt": False})
+    return _linked(module, called, "part_step", lines, {"_nrt": False})
+
+
+@cache
+def load_around_step(module: str, called: str, runtime: str) -> Callable[..., Any]:
+    """Return function `called` of runtime module `module`, with the `step` of `runtime` linked as in `load_linked`."""
+    with _LOADING:
+        lines = ["from softneck.runtime import load_runtime", f'step = load_runtime("{runtime}").step']
+        lines += [f'content = "{compiled_name(bundle(runtime))}"', "del load_runtime"]
+        return _linked(module, called, "step", lines)
+
+
+def _linked(
+    module: str, called: str, name: str, lines: Sequence[str], more: Mapping[str, Any] | None = None
+) -> Callable[..., Any]:
+    """Return function `called` of `module`, in which `lines` define `name`; `more`: as for `_compile`."""
+    text = bundle(module, loops=False, skip=(name,)) + "\n".join(lines) + "\n"
+    namespace = _import_text(text, compiled=True)
+    _compile(namespace, (called,), more)
     return getattr(namespace, called)
 
 

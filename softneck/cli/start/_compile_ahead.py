@@ -31,14 +31,17 @@ _ROWS = 2000
 def compile_ahead(*recordings: str) -> None:
     """Compile what the steps after the models call, in a process that no step waits for.
 
-    Run are the loops of the first controllers over a family of few rows, then those over the best model if that is
-    nonlinear, and the predictions of the report; the steps then load the functions from the cache.
+    Run are an observer and the loops of the first controllers over a family of few rows, then loops over the best model
+    if that is nonlinear, and the predictions of the report; the steps then load the functions from the cache.
     """
-    from softneck import signals
+    from softneck import estimation, signals
 
     gc.set_threshold(*GARBAGE_THRESHOLDS)
     first = signals.read_recording(recordings[0])
-    family = _family_of(first.rows(0, _ROWS))
+    few = first.rows(0, _ROWS)
+    family = _family_of(few)
+    with contextlib.suppress(SoftneckError):
+        estimation.fit_observer(estimation.KalmanSettings().design(family), [few], set())
     if family.draws is not None:
         _judge_kinds(family, family.draws.model)
     _await(PI)  # the models are there then

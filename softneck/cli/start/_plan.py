@@ -227,7 +227,8 @@ def _models(recordings: list[str], options: Options) -> Iterator[Step]:
     yield Step(stage="identification", command=command, makes=(PI,), reads=(linear,), unmet=Unmet.NO_MODEL)
     data = [word for recording in recordings for word in ("--data", recording)]
     command = ("softneck", "observer", linear, *data, "-o", OBSERVER, "--force")
-    yield Step(stage="observer", command=command, makes=(OBSERVER,), reads=(linear, *recordings))
+    yield Step(stage="observer", command=command, makes=(OBSERVER,), reads=(linear, *recordings),
+               beside=tuple(_fmus(options)[:1]))  # fmt: skip
     yield family
 
 
@@ -246,7 +247,7 @@ def nonlinear_model() -> str | None:
 def _controller(options: Options) -> Iterator[Step]:
     family = Path(FAMILY).is_file()
     linear, nonlinear = FAMILY if family else linear_model(), nonlinear_model()
-    plant = nonlinear or linear_model()
+    plant = _plant()
     # Where draws decide, a nonlinear model that predicts worse than the linear one has no say.
     drawn = family and load(FAMILY).draws is not None
     plants = (linear, AUTO if drawn else plant) if family or nonlinear else (linear,)
@@ -261,7 +262,7 @@ def _controller(options: Options) -> Iterator[Step]:
              if value is not None for word in (name, str(value))]  # fmt: skip
     # --force continues the same search, and replaces another one.
     command = ("softneck", "tune", *plants, *words, "--observer", OBSERVER, "-o", "tune", "--force")
-    fmus = _fmus(plant, options)
+    fmus = _fmus(options)
     yield Step(stage="tune", command=command, makes=(BEST, _TUNED_LOOP, "tune/report.html", TUNER),
                reads=(*plants, OBSERVER, *wanted), finding=finding, beside=tuple(fmus[:2]))  # fmt: skip
     eyes = (OBSERVER,) if "observer" in read_toml(_TUNED_LOOP) else ()
@@ -273,7 +274,12 @@ def _controller(options: Options) -> Iterator[Step]:
     yield from fmus
 
 
-def _fmus(plant: str, options: Options) -> list[Step]:
+def _plant() -> str:
+    """Return the file of the model that loops and FMUs take for the robot."""
+    return nonlinear_model() or linear_model()
+
+
+def _fmus(options: Options) -> list[Step]:
     """Return the steps of the three FMUs: plant, observer, controller."""
     made = options.backend
     if made == "compiled":
@@ -281,7 +287,7 @@ def _fmus(plant: str, options: Options) -> list[Step]:
         made = backend(packaged=(len(robot.motors.names), len(robot.outputs.names)) == (3, 2))
     return [
         Step(stage="FMUs", command=("softneck", "fmu", file, "--backend", made, "-o", fmu, "--force"), makes=(fmu,),
-             reads=(file,)) for file, fmu in ((plant, PLANT_FMU), (OBSERVER, OBSERVER_FMU), (BEST, CONTROLLER_FMU))
+             reads=(file,)) for file, fmu in ((_plant(), PLANT_FMU), (OBSERVER, OBSERVER_FMU), (BEST, CONTROLLER_FMU))
     ]  # fmt: skip
 
 

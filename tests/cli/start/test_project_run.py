@@ -128,13 +128,13 @@ def test_steps_that_begin_early_read_nothing_that_the_steps_before_their_turn_ma
     Path("tune/loop.toml").write_text("duration_s = 7.0\n", encoding="utf-8")
     asked = _plan.Options(logs=())
     early = 0
-    for planned in (list(_plan._models(["recordings/log.csv"], asked)), list(_plan._controller(asked))):
-        for number, step in enumerate(planned):
-            for other in step.beside:
-                between = planned[number : planned.index(other)]
-                assert not set(other.reads) & {name for one in between for name in one.makes}
-                early += 1
-    assert early == 3, "the family beside the models, the FMUs of plant and observer beside the search"
+    planned = [*_plan._models(["recordings/log.csv"], asked), *_plan._controller(asked)]
+    for number, step in enumerate(planned):
+        for other in step.beside:
+            between = planned[number : planned.index(other)]
+            assert not set(other.reads) & {name for one in between for name in one.makes}
+            early += 1
+    assert early == 4, "the family beside the models, the plant's FMU beside the observer, two beside the search"
 
 
 def test_a_step_that_failed_beside_another_tells_of_it_in_its_turn(
@@ -218,6 +218,7 @@ def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model_i
     Path("models").mkdir()
     Path("models", f"auto_{'linear' if nonlinear else 'nonlinear'}.npz").touch()  # the best of the other sort
     monkeypatch.setattr(softneck, "tuning", tuning)
+    monkeypatch.setattr(softneck, "estimation", _Estimation(ran))
     monkeypatch.setattr(softneck, "family", family_of)
     monkeypatch.setattr(_compile_ahead.time, "sleep", comes)
     monkeypatch.setattr(_compile_ahead, "cache_folder", lambda: tmp_path)
@@ -233,7 +234,8 @@ def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model_i
 
     # Last what the report predicts with: the best model and the best linear one.
     report = [("log.csv", "models/auto.npz"), *([("log.csv", "models/auto_linear.npz")] if nonlinear else [])]
-    assert ran == [*judged("drawn", False), *(judged(auto, True) if nonlinear else []), *report]
+    observed = ("observer", ["log.csv to 2000"], set())
+    assert ran == [observed, *judged("drawn", False), *(judged(auto, True) if nonlinear else []), *report]
     assert len(asked) == (1 if few == "explain" else 2)
     assert _compile_ahead.compiled_before().is_file()
 
@@ -251,6 +253,17 @@ class _Rows(str):
 @dataclass(frozen=True)
 class _Family:
     draws: Any = field(default_factory=lambda: SimpleNamespace(model="drawn"))
+
+
+@dataclass(frozen=True)
+class _Estimation:
+    ran: list[tuple[Any, ...]]
+
+    def KalmanSettings(self) -> Any:
+        return SimpleNamespace(design=lambda _: "observer")
+
+    def fit_observer(self, *asked: Any) -> None:
+        self.ran.append(asked)
 
 
 @dataclass(frozen=True)
