@@ -180,7 +180,10 @@ def _log(file: Path, html: Path | None, error: DataError | FileFormatError | Non
         other = signals.is_of_another_robot(file)
         guess = signals.guess_robot(file) if other else signals.guess_layout(file)
     except (DataError, FileFormatError) as reason:
-        raise error or FileFormatError(
+        if error is not None:
+            foreign = isinstance(error.__cause__, signals.ForeignColumnError)
+            raise (reason if foreign else error) from None
+        raise FileFormatError(
             f"{file}: by its ending not a file of softneck, nor is it a log ({str(reason).removeprefix(f'{file}: ')})"
         ) from reason
     missing = guess.missing if isinstance(guess, signals.Guess) else ()

@@ -300,10 +300,8 @@ def motor_ends(robot: Robot, what: str) -> tuple[Vector, Vector]:
     """Return the lowest and highest set-points (motors,) in SI; raise SettingsError if the robot gives none."""
     motors, factor = robot.motors, to_si(robot.motors.unit)[0]
     if motors.setpoint_min is None or motors.setpoint_max is None:
-        raise SettingsError(
-            f"robot {robot.label()} gives no `motors.setpoint_min` and `setpoint_max`, which {what} needs to "
-            "know how far its outputs go; add them."
-        )
+        ends = ["`motors.setpoint_min` and `setpoint_max`"]
+        raise robot.error_without(ends, f"{what} needs to know how far its outputs go")
     return factor * np.array(motors.setpoint_min), factor * np.array(motors.setpoint_max)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -280,8 +280,14 @@ class Robot(ReprMixin):
         """
         value = getattr(self, key)
         if value is None:
-            raise SettingsError(f"robot {self.label()} gives no `{_file.KEY_OF[key]}`, which {what} needs; add it.")
+            raise self.error_without([f"`{_file.KEY_OF[key]}`"], f"{what} needs")
         return value
+
+    def error_without(self, keys: Sequence[str], why: str) -> SettingsError:
+        """Return the error about keys that the robot does not give; `why` says what needs them."""
+        them = "it" if len(keys) == 1 and " and " not in keys[0] else "them"
+        where = "" if self.file is not None else " to its robot file, and name that by `--robot FILE`"
+        return SettingsError(f"robot {self.label()} gives no {', and no '.join(keys)}, which {why}; add {them}{where}.")
 
     def label(self) -> str:
         """Return name, short hash and file, to identify a robot in messages."""

@@ -53,6 +53,7 @@ from .quality._excitation import poor_excitation as poor_excitation
 from .quality._excitation import why_at_rest as why_at_rest
 from .recording._channels import NECK as NECK
 from .recording._channels import OUTPUTS as OUTPUTS
+from .recording._channels import ForeignColumnError as ForeignColumnError
 from .recording._channels import file_unit as file_unit
 from .recording._channels import is_held as is_held
 from .recording._channels import known_channels as known_channels

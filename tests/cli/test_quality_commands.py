@@ -74,3 +74,17 @@ def test_a_wrong_limit_is_one_line(call: Call, tmp_path: Path) -> None:
     said = call("record", "eq22", "-o", "r.csv", "--max-position", 0)
     assert (said.code, said.error) == (2, "softneck: `position` must be positive [rad]; got 0.")
     assert not list(tmp_path.iterdir())
+
+
+def test_info_of_another_loggers_table_tells_what_it_lacks_as_a_log(call: Call, tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text("time [s],valve [V],angle [deg]\n" + "".join(f"{k},2.5,{k % 7}\n" for k in range(50)))
+    said = call("info", str(log))
+    assert said.code == 2
+    assert "no column was recognised as motor (valve [V] is constant at 2.5" in said.error
+    # Whoever asks for a recording learns how a logger's table becomes one.
+    said = call("identify", "oe", str(log))
+    assert said.code == 2
+    assert "column `valve` is not a channel of a recording of robot `neck`" in said.error
+    assert "use `softneck import` with --guess" in said.error
+    assert len(said.error.splitlines()) == 1

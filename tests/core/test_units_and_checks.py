@@ -38,10 +38,20 @@ def test_a_unit_has_its_si_unit_and_factor(unit: str, si: str, factor: float) ->
     ("text", "unit"),
     [("mPa", "MPa"), ("MPa", "MPa"), ("mN", "mN"), ("µs", "us"), ("μm", "um"), ("GRAD/s", "deg/s"), ("°", "deg"),
      ("Nm", "Nm"), ("rev", "turns"), ("KPA", "kPa"), ("bar/s", "bar/s"),
+     ("kV", "kV"), ("µN", "uN"), ("N m", "Nm"), ("mN·m", "mNm"), ("kN*m", "kNm"), ("N mm", "Nmm"), ("kΩ", "kOhm"),
+     ("mL/min", "ml/min"), ("MHz", "MHz"), ("MV", "mV"), ("m/s/s", None),
      ("foo", None), ("", None), ("foo/s", None), ("c", None)],
 )  # fmt: skip
 def test_a_spelling_of_logs_is_one_unit_or_none(text: str, unit: str | None) -> None:
     assert spelled_unit(text) == unit
+
+
+def test_prefixes_and_products_have_the_factors_of_their_parts() -> None:
+    # One product: half a unit in the last place.
+    for unit, factor, of in (("kV", 1e3, "V"), ("uNm", 1e-6, "Nm"), ("MPa", 1e6, "Pa"), ("mbar", 1e-3, "bar")):
+        assert to_si(unit) == (pytest.approx(factor * to_si(of)[0], rel=1e-15), to_si(of)[1])
+    # The definitions of litre and minute: 60,000 l/min are a cubic metre a second.
+    assert to_si("l/min") == (pytest.approx(1.0 / 60_000.0, rel=1e-15), "m3/s")
 
 
 def test_every_unit_spells_itself_and_no_spelling_is_of_two_units() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import zipfile
 from pathlib import Path
 
 import h5py
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from softneck.core import DataError, FileFormatError, SettingsError, SoftneckError
-from softneck.signals import Recording, import_log, read_layout
+from softneck.signals import Recording, guess_layout, import_log, read_layout
 from softneck.signals.importing.formats._mat import mat_arrays
 
 CHANNELS = ("motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3", "pitch", "roll")
@@ -128,6 +129,15 @@ def test_a_small_file_that_declares_a_huge_table(tmp_path: Path) -> None:
         file.create_dataset("log", (2**40, 6), "f8", chunks=(1024, 6))
     with pytest.raises(DataError, match=r"declares \d+ numbers; that is not a log"):
         load(tmp_path, "a.mat", layout_text(False, '[file]\nvariable = "log"'))
+
+
+def test_a_member_that_is_no_array_is_left_out(tmp_path: Path) -> None:
+    log = tmp_path / "log.npz"
+    with zipfile.ZipFile(log, "w") as archive:
+        archive.writestr("../evil.npy", b"no array")
+    with pytest.raises(DataError, match=r"log\.npz: has no vectors of numbers"):
+        guess_layout(log)
+    assert list(tmp_path.iterdir()) == [log]
 
 
 def test_what_is_no_mat_file(tmp_path: Path) -> None:

@@ -334,3 +334,55 @@ def test_the_reported_logs_are_read_as_their_readme_says(
     assert taken(guess) == roles
     assert set(left_out) <= set(guess.lines)
     assert is_of_another_robot(path)
+
+
+# How other loggers write the titles of one robot: kilovolts in, micrometres out.
+STYLES = (
+    ("t [s]", "U_cmd [kV]", "tip [µm]"), ("t (s)", "U_cmd (kV)", "tip (um)"), ("t/s", "U_cmd / kV", "tip / μm"),
+    ("t_s", "U_cmd_kV", "tip_um"), ("t [s]", "Ucmd[kV]", "tip[µm]"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("titles", STYLES, ids=lambda titles: titles[1])
+def test_no_style_of_titles_loses_a_unit_or_puts_it_into_a_name(titles: tuple[str, str, str], tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    np.savetxt(log, np.column_stack([TIME, A, ONE]), delimiter=",", header=",".join(titles), comments="", fmt="%.6f")
+    guess = guess_robot(log)
+    robot = guess.robot
+    assert (robot.motors.unit, robot.outputs.unit, robot.outputs.names) == ("kV", "um", ("tip",))
+    assert robot.motors.names[0].replace("_", "") == "Ucmd"
+    assert [doubt.about for doubt in guess.doubts] == ["robot"]
+    # The robot that was proposed finds the same columns in the next log.
+    assert layout_for(log, robot).layout.channels == guess.layout.channels
+
+
+def test_greek_letters_are_words(tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    titles = "t [s],τ_cmd [mN·m],θ [deg],ω [deg/s]"
+    data = np.column_stack([TIME, A, ONE, NOISE[0]])
+    np.savetxt(log, data, delimiter=",", header=titles, comments="", fmt="%.6f", encoding="utf-8")
+    guess = guess_robot(log)
+    assert (guess.robot.motors.names, guess.robot.motors.unit) == (("tau_cmd",), "mNm")
+    assert guess.robot.outputs.names == ("theta",)
+
+
+@pytest.mark.parametrize("rows", range(4))
+def test_a_log_of_few_rows_is_read_or_refused_in_one_line(rows: int, tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    lines = [f"{0.1 * k:g},{k % 3},{(k + 1) % 3}" for k in range(rows)]
+    log.write_text("\n".join(["time [s],u [V],y [mm]", *lines, ""]))
+    if rows < 2:
+        with pytest.raises(
+            DataError, match=rf"log\.csv: has {rows} row\(s\) of numbers; a log has one for each sample"
+        ):
+            guess_robot(log)
+    else:
+        assert guess_robot(log).robot.motors.unit == "V"
+
+
+def test_an_input_that_stands_still_is_named(tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    data = np.column_stack([TIME, np.full(ROWS, 2.5), ONE])
+    np.savetxt(log, data, delimiter=",", header="time [s],valve [V],angle [deg]", comments="", fmt="%.6f")
+    with pytest.raises(DataError, match=r"no column was recognised as motor \(valve \[V\] is constant at 2\.5"):
+        guess_robot(log)

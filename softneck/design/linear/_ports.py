@@ -222,10 +222,7 @@ def limits_of(robot: Robot, *, lead_limit: float | None, least_cocontraction: fl
     missing = ["`motors.setpoint_min` and `setpoint_max`"] * (ranges is None)
     missing += ["`motors.rate_limit`"] * (motors.rate_limit is None and largest is None)
     if ranges is None or missing:
-        raise SettingsError(
-            f"robot {robot.label()} gives no {', and no '.join(missing)}, which a controller needs; add "
-            f"{'them' if len(missing) > 1 else 'it'} to its robot file."
-        )
+        raise robot.error_without(missing, "a controller needs")
     rates = [factor * rate for rate in motors.rate_limit or ()]
     most = float(np.abs(ranges).max())
     least = -most

@@ -304,6 +304,7 @@ class SetMembership:
             )
         # The drives are known from all rows: they are no part of what is chosen.
         first = self._ground(head, ground.drive, training.has_time_constant)
+        first = replace(first, table=ground.table)  # the scale is of these lags, and fewer rows would shorten them
         hold_out = HoldOut(first, first.data(head), tail, epsilons, narrow=self.form == "residual")
         if self.output_weight is not None:
             outputs, motors = (self.output_weight,), ()

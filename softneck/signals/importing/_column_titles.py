@@ -53,10 +53,32 @@ def plain(text: str) -> str:
 def words_of(title: str) -> list[str]:
     """Return the words and numbers of a title in English and lower case."""
     found: list[str] = []
-    folded = unicodedata.normalize("NFKD", title.replace("ß", "ss").replace("µ", "u"))
-    for word in _WORD.findall("".join(c for c in folded if not unicodedata.combining(c))):
+    for word in _WORD.findall(_latin(title.replace("µ", "u"))):
         found += _parts(word.lower())
     return found
+
+
+def _latin(text: str) -> str:
+    """Return a text without accents, and Greek letters by their names: `Δp` is `Delta p`."""
+    folded = unicodedata.normalize("NFKD", text.replace("ß", "ss"))
+    return "".join(_letter(c) for c in folded if not unicodedata.combining(c))
+
+
+def _letter(c: str) -> str:
+    greek = "" if c.isascii() else unicodedata.name(c, "")
+    if not greek.startswith("GREEK") or "LETTER" not in greek:
+        return c
+    name = greek.split()[-1].lower()
+    return f" {name.capitalize() if c.isupper() else name} "
+
+
+def name_of(title: str) -> str:
+    """Return what names a column in its title, without the unit and in Latin letters: `tip_mm` is `tip`."""
+    text, written = _without_unit(title.strip())
+    head, _, last = text.replace(" ", "_").rpartition("_")
+    if not written and head and len(last) > 1 and spelled_unit(last) and last.lower() not in _WORDS_TOO:
+        text = text[: len(head)]
+    return re.sub(r"[\W_]+", "_", _latin(text), flags=re.ASCII).strip("_")
 
 
 def _is_german(title: str) -> bool:
@@ -88,13 +110,13 @@ def _split(word: str) -> list[str]:
 
 
 # Units that are words as well: only in brackets, and as the last word of no title.
-_WORDS_TOO = {"in", "ma", "pa", "mn", "kn", "mt", "um", "atm", "day", "tag"}
+_WORDS_TOO = {"in", "ma", "pa", "mn", "kn", "ka", "kv", "km", "ml", "ua", "un", "mt", "atm", "day", "tag"}
 #: Of temperatures, known units or not.
 TEMPERATURES = {"c", "degc", "°c", "degf", "°f", "f", "k"}
 # What stands where a unit would, and is none: an encoder's counts, numbers without a unit.
 _NO_UNITS = {"", "-", "1", "counts", "count", "ticks", "inc", "lsb", "raw", "a.u.", "au", "n/a"}
 # `_V` and `_kPa` at the end of a title; in lower case some are words.
-_CAPITAL = re.compile(r"[_ ](V|A|N|W|Nm|Pa|kPa|hPa|MPa|mmHg|degC|°C)$")
+_CAPITAL = re.compile(r"[_ ]([mku]?[VAN]|[mk]?W|[mk]?Nm|Pa|kPa|hPa|MPa|mmHg|degC|°C)$")
 # `setpoint / rad`, as DIN 1313 writes units of axes.
 _SLASH = re.compile(r"\s/\s*(\S+)\s*$")
 _BRACKET = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")

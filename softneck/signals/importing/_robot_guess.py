@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-import unicodedata
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -17,7 +16,7 @@ from softneck.core import DataError, SettingsError, SoftneckError, did_you_mean,
 from softneck.robot import Robot
 
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, SET_POINTS, parse_column, si_unit
-from ._column_titles import ambiguity
+from ._column_titles import ambiguity, name_of
 from ._draft import SURE, Doubt, Draft
 from ._guess import guess_clock
 from ._guess_names import by_names
@@ -105,7 +104,10 @@ def guess_robot(
             roles = find_roles(table, {**given, "time": [term.column for term in clock[0].time.terms]})
     if not roles.motors or not roles.outputs:
         what = "motor" if not roles.motors else "output"
-        raise DataError(f"{path}: no column was recognised as {what}. Name them: {columns_line(path, table, roles)}")
+        still = [f"{name} is {why}" for name, why in roles.left_out.items() if why.startswith("constant")]
+        beside = f" ({'; '.join(still)})" if still else ""
+        line = columns_line(path, table, roles)
+        raise DataError(f"{path}: no column was recognised as {what}{beside}. Name them: {line}")
     if roles.time is None and sample_time is None and clock is None:
         raise DataError(f"{path}: no column is a time; say its sample time: --sample-time S.")
     whole = bool(given["motors"] and given["outputs"])
@@ -285,7 +287,8 @@ def layout_for(path: str | Path, robot: Robot, *, sample_time: float | None = No
     rest = [title for title in table.columns if isinstance(title, str) and title not in (roles.time, roles.run)]
     if not rest:
         raise DataError(f"{path}: has no titles; name its columns: {columns_line(path, table, roles)}")
-    found = {" ".join(_WORD.findall(_UNIT.sub("", title).lower())): title for title in rest}
+    found = {" ".join(_WORD.findall(name_of(title).lower())): title for title in rest}
+    found |= {" ".join(_WORD.findall(_UNIT.sub("", title).lower())): title for title in rest}
 
     def title_of(*names: str) -> str:
         keys = [" ".join(_WORD.findall(name.lower())) for name in names]
@@ -370,8 +373,7 @@ def _names(titles: Sequence[Column]) -> list[str]:
     """Return titles as unique names of letters, digits and _ that start with a letter."""
     names: list[str] = []
     for number, title in enumerate(titles):
-        title = "".join(c for c in unicodedata.normalize("NFKD", str(title)) if not unicodedata.combining(c))
-        name = re.sub(r"\W+", "_", _UNIT.sub("", title).strip(), flags=re.ASCII).strip("_") or f"c{number + 1}"
+        name = name_of(str(title)) or f"c{number + 1}"
         name = name if name[0].isalpha() else f"c_{name}"
         names.append(name if name not in names else f"{name}_{number + 1}")
     return names

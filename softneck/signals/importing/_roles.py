@@ -175,6 +175,7 @@ def _read(table: SniffResult, column: Column) -> _Words:
     title = table.title(column)
     words = {part for word in title.family.split() for part in _split(word)}
     words |= {"temp"} if plain(title.written) in TEMPERATURES else set()
+    words -= {"supply"} if words & _COMMAND else set()
     return _Words(frozenset(words), title.motor, title.unit, None if title.unit == "1" else title.quantity or None)
 
 

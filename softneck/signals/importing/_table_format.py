@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 # Enough lines to detect a format.
 _HEAD_BYTES = 2**16
 _HEAD_ROWS = 500
+# Of fewer rows nothing can be guessed, not even a clock.
+_FEWEST_ROWS = 2
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)", re.IGNORECASE)
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
 _COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
@@ -97,11 +99,13 @@ def sniff(path: str | Path, *, fewest: int = MIN_COLUMNS) -> SniffResult:
             words.append(key)
         else:
             columns[key] = values
-    if len(columns) < fewest:
+    if len(columns) < fewest and len(frame):
         raise DataError(
             f"{source}: has {len(columns)} column(s) of numbers; a recording needs one for each set-point and output. "
             "Is this a log? If so, write its delimiter into a layout and use --layout."
         )
+    if len(frame) < _FEWEST_ROWS:
+        raise DataError(f"{source}: has {len(frame)} row(s) of numbers; a log has one for each sample.")
     if form.merge or _is_sparse(columns):
         form = replace(form, merge=True)
         columns = {name: last_values(values) for name, values in columns.items()}

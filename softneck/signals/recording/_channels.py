@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, SettingsError, Vector, to_si
+from softneck.core import DataError, Matrix, SettingsError, Vector, did_you_mean, to_si
 from softneck.robot import Robot
 
 NECK = Robot.preset("neck")
@@ -38,7 +38,12 @@ _COMMON_UNITS = {
 }
 # Channels that are commanded or boolean: they hold their value until the next sample.
 _HELD_CHANNELS = re.compile(r"(motor_setpoint_\d|.*_setpoint|.*_reference|healthy|enabled|measurement_valid|payload)$")
+_IMPORT = "use `softneck import` with --guess if this is a logger's table"
 _COLUMN_TITLE = re.compile(r"^(?P<name>[^\[\]]+?)\s*\[(?P<unit>[^\[\]]*)\]$")
+
+
+class ForeignColumnError(DataError):
+    """A column that no recording of the robot has: the table may be one of another logger."""
 
 
 @cache
@@ -95,13 +100,14 @@ def parse_column(title: str, robot: Robot = NECK) -> tuple[str, float]:
     match = _COLUMN_TITLE.match(title.strip())
     if match is None:
         name = title.strip()
-        hint = f"write `{column_name(name, robot)}`" if name in table else "use `softneck import` with a layout"
-        raise DataError(f"column `{name}` names no unit; {hint}.")
+        if name in table:
+            raise DataError(f"column `{name}` names no unit; write `{column_name(name, robot)}`.")
+        raise ForeignColumnError(f"column `{name}` names no unit; {_IMPORT}.")
     name, unit = robot.own(match["name"]), match["unit"].strip()
     if name not in table:
-        raise DataError(
-            f"column `{name}` is not a channel of a recording of robot {robot.label()} (those are {', '.join(table)}, "
-            "run); rename or drop it, or use `softneck import` with a layout."
+        raise ForeignColumnError(
+            f"column `{name}` is not a channel of a recording of robot {robot.label()}; "
+            f"{did_you_mean(name, table)}{_IMPORT}; or drop the column."
         )
     factor, unit_si = to_si(unit)
     if unit_si != si_unit(name, robot):

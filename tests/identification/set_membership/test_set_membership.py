@@ -25,7 +25,9 @@ from softneck.identification.set_membership._regressor import (
     usual_width,
 )
 from softneck.identification.set_membership._set_membership import noise_level
+from softneck.robot import Robot
 from softneck.runtime import load_functions
+from softneck.signals import Recording
 
 from ...data import TS, neck_recording, recording_from, short_neck
 from .hard_sets import algorithm_1, hard_sets
@@ -271,6 +273,23 @@ def test_the_residual_form_is_its_base_and_a_set_over_its_signals(models: dict) 
             gamma, epsilon = arrays["bounds"][axis]
             bounds = algorithm_1(x, arrays["points"][axis].T, arrays["values"][axis], gamma, epsilon)
             np.testing.assert_allclose(Y[k, 5 + 2 * axis : 7 + 2 * axis], base[k, axis] + np.array(bounds), atol=1e-7)
+
+
+def test_the_scale_is_of_the_lags_that_the_set_is_over() -> None:
+    """It is chosen on fewer rows, which bound the lags of a slow robot: an oven's 72 s at 2 s."""
+    heater = Robot.from_dict({
+        "name": "oven", "motors": {"names": ["heater"], "unit": "A"},
+        "outputs": {"names": ["plate"], "unit": "degC"}, "directions": {"kind": "identified"},
+    })  # fmt: skip
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.uniform(0.0, 3.0, 24), 25)
+    y = np.zeros_like(u)
+    for k in range(1, len(u)):
+        y[k] = y[k - 1] + (9.0 * u[max(k - 4, 0)] - y[k - 1]) / 36.0
+    y += 0.05 * rng.standard_normal(len(y))
+    recording = Recording.from_arrays(u[:, None], y[:, None], sample_time=2.0, robot=heater)
+    model = SetMembership(form="residual").fit(recording)
+    assert len(model.findings["scale"]) == len(model.arrays["table"])
 
 
 def test_a_residual_cannot_drift(models: dict) -> None:

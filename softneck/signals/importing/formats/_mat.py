@@ -181,7 +181,9 @@ def _numpy_arrays(source: Path) -> dict[str, np.ndarray] | None:
         raise
     except Exception as error:  # damaged bytes raise all kinds of errors in zipfile, its decompressors and numpy
         raise FileFormatError(f"{source}: cannot be read as arrays of NumPy ({error_reason(error)}).") from error
-    kept = {name: array for name, array in arrays.items() if array.dtype.kind in "biuf" and array.ndim in (1, 2)}
+    # Of a member that is no array NumPy returns the bytes.
+    kept = {name: array for name, array in arrays.items() if isinstance(array, np.ndarray) and array.ndim in (1, 2)}
+    kept = {name: array for name, array in kept.items() if array.dtype.kind in "biuf"}
     return {name: np.atleast_2d(array).astype(np.float64) for name, array in kept.items() if array.size}
 
 
