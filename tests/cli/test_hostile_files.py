@@ -55,9 +55,11 @@ def holes(begin: bytes, size: int = 4 * 2**30) -> Callable[[Path], None]:
     return write
 
 
-def text(content: str) -> Callable[[Path], None]:
+def text(content: str | Callable[[], str]) -> Callable[[Path], None]:
+    """A large text is made when it is written: every run of pytest imports this file."""
+
     def write(path: Path) -> None:
-        path.write_text(content)
+        path.write_text(content if isinstance(content, str) else content())
 
     return write
 
@@ -114,9 +116,12 @@ CASES: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "holes.csv": (holes(LOG), ["identify", "rls", "holes.csv", "-o", "m.npz"]),
     "holes_seen.csv": (holes(LOG), ["info", "holes_seen.csv"]),
     "small_holes.csv": (holes(LOG, 900 * 2**20), [IMPORT, "small_holes.csv", *GUESS]),
-    "wide.csv": (text((",".join("1" * 10**6) + "\n") * 3), ["identify", "rls", "wide.csv", "-o", "m.npz"]),
-    "wide_seen.csv": (text((",".join(f"c{k}" for k in range(10**6)) + "\n") * 2), [IMPORT, "wide_seen.csv", *GUESS]),
-    "line.csv": (text("1" * 50_000_000), [IMPORT, "line.csv", *GUESS]),
+    "wide.csv": (text(lambda: (",".join("1" * 10**6) + "\n") * 3), ["identify", "rls", "wide.csv", "-o", "m.npz"]),
+    "wide_seen.csv": (
+        text(lambda: (",".join(f"c{k}" for k in range(10**6)) + "\n") * 2),
+        [IMPORT, "wide_seen.csv", *GUESS],
+    ),
+    "line.csv": (text(lambda: "1" * 50_000_000), [IMPORT, "line.csv", *GUESS]),
     "zeros.mat": (mat, [IMPORT, "zeros.mat", *GUESS]),
     "holes.parquet": (holes(b"PAR1"), ["identify", "rls", "holes.parquet", "-o", "m.npz"]),
     "holes.mcap": (holes(b"\x89MCAP0\r\n"), [IMPORT, "holes.mcap", "-o", "out.csv"]),
@@ -136,7 +141,7 @@ CASES: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "brackets.toml": (text("a = " + "[" * 100_000), ["drives", "check", "--drives", "brackets.toml", "--simulated"]),
     "needs.toml": (holes(b"version = 1\n"), ["verify", "pi.npz", "pi.npz", "--requirements", "needs.toml"]),
     "a.certificate.json": (holes(b"{\n"), ["info", "a.certificate.json"]),
-    "line.log": (text("(1.000000) can0 181#00\n" + "0" * 300_000_000), ["info", "line.log"]),
+    "line.log": (text(lambda: "(1.000000) can0 181#00\n" + "0" * 300_000_000), ["info", "line.log"]),
     "start.json": (holes(b"{}"), ["start", "log.csv", "-o", ".", "--yes"]),
     "given.toml": (holes(b"a = 1\n"), ["new", "made", "--loop", "given.toml"]),
     "robot_given.toml": (holes(b"a = 1\n"), ["robot", "new", "--preset", "robot_given.toml"]),
