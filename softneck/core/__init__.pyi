@@ -45,6 +45,7 @@ from ._certificate import certificate_contents as certificate_contents
 from ._certificate import certificate_path as certificate_path
 from ._certificate import required_rows as required_rows
 from ._certificate import sim_name as sim_name
+from ._certificate import to_json as to_json
 from ._checks import finite_matrix as finite_matrix
 from ._checks import finite_vector as finite_vector
 from ._content import compute_once as compute_once

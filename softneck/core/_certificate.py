@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from softneck import __version__
 
 from ._display import ReprMixin
-from ._errors import CheckFailedError, FileFormatError
+from ._errors import CheckFailedError, DataError, FileFormatError
 from ._files import MOST_JSON, file_hash, settings_text, write_text
 
 CERTIFICATE_VERSION = 1
@@ -178,6 +181,26 @@ def certificate_path(controller: str | Path) -> Path:
     source = Path(controller)
     beside = source.with_name(source.stem + CERTIFICATE_ENDING)
     return beside if beside.exists() else _FOLDER / beside.name
+
+
+def _refuse(value: Any) -> None:
+    raise DataError(f"a certificate cannot hold a {type(value).__name__}.")
+
+
+def to_json(value: Any, other: Callable[[Any], Any] = _refuse) -> Any:
+    """Convert numbers, arrays and tables to JSON values; numbers that are not finite become None.
+
+    `other`: converts a value of any other type; by default DataError is raised.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): to_json(item, other) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return to_json(value.tolist(), other)
+    if isinstance(value, list | tuple):
+        return [to_json(item, other) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, str | bool | int) else other(value)
 
 
 def _seal(contents: Mapping[str, Any]) -> str:

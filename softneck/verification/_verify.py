@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from softneck.core import (
-    DataError,
     Progress,
     ReprMixin,
     SettingsError,
     certificate_contents,
     one_blas_thread,
     shown_progress,
+    to_json,
 )
 from softneck.design import own_object
 from softneck.estimation import robot_of
@@ -383,18 +383,3 @@ def _source_facts(neck: PlantSource) -> dict[str, Any]:
         found[axis] = {"nominal": box.nominal, "low": box.low, "high": box.high, "samples": len(box.samples)}
         found[axis]["unit"] = [neck.gain_unit, "1/s", "s"]
     return found
-
-
-def to_json(value: Any) -> Any:
-    """Convert numbers, arrays and tables to JSON values; numbers that are not finite become None."""
-    if isinstance(value, Mapping):
-        return {str(key): to_json(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return to_json(value.tolist())
-    if isinstance(value, list | tuple):
-        return [to_json(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, str | bool | int):
-        return value
-    raise DataError(f"a certificate cannot hold a {type(value).__name__}.")

@@ -14,7 +14,7 @@ import control
 import numpy as np
 import pytest
 
-from softneck.core import DataError, FileFormatError, SettingsError, silent
+from softneck.core import DataError, FileFormatError, SettingsError, silent, to_json
 from softneck.core._certificate import required_rows
 from softneck.design import grid_response
 from softneck.estimation import LinearNeck
@@ -42,7 +42,7 @@ from softneck.verification._plants import (
 )
 from softneck.verification._requirements import Requirement, apply_safety_margin, expand_metrics, select_for_verify
 from softneck.verification._steps import StepTest, _metrics, check_ports, middle_motors, middle_of, run_steps
-from softneck.verification._verify import sources_of, to_json
+from softneck.verification._verify import sources_of
 
 from .necks import TS, controller_of, family, linear_neck, pi
 

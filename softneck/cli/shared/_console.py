@@ -13,14 +13,14 @@ from typing import Any
 import click
 
 from softneck import identification
-from softneck.core import Progress, bar_columns, silent
+from softneck.core import Progress, bar_columns, silent, to_json
 from softneck.core import Progress as ProgressCallback
 from softneck.core import percent as percent
 
 
 def print_json(value: Any) -> None:
     """Print one JSON object; numbers that JSON does not have become null."""
-    click.echo(json.dumps(_plain(value), indent=2, sort_keys=False, allow_nan=False))
+    click.echo(json.dumps(to_json(value, str), indent=2, allow_nan=False))
 
 
 # A pipe or a log has no width: no table is cut there.
@@ -69,20 +69,6 @@ def progress(what: str, *, quiet: bool = False) -> Iterator[ProgressCallback]:
     with Progress(SpinnerColumn(), *bar_columns(), console=console, transient=True) as bar:
         task = bar.add_task(what, total=1.0)
         yield lambda done, word: bar.update(task, completed=done, description=f"{what}: {word}")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, float) and (value != value or abs(value) == float("inf")):
-        return None
-    if isinstance(value, str | int | float | bool) or value is None:
-        return value
-    return str(value)
 
 
 class Stages:
