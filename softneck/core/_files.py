@@ -292,12 +292,20 @@ def _to_disk(path: Path) -> None:
 
 
 def refuse_existing(path: str | Path, *, force: bool) -> None:
-    """Raise OutputFileError if `path` is a folder, or a file that `force` does not allow to replace."""
+    """Raise OutputFileError if `path` is a folder, a file that `force` does not allow to replace, or not writable.
+
+    Commands call this before their work, which may take minutes.
+    """
     target = Path(path)
     if target.is_dir():
         raise OutputFileError(f"{target}: is a folder; name a file.")
     if target.exists() and not force:
         raise OutputFileError(f"{target}: exists already; use --force to replace it or choose another name.")
+    folder = next(parent for parent in Path(os.path.realpath(target)).parents if parent.exists())
+    if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
+        read_only = os.statvfs(folder).f_flag & os.ST_RDONLY
+        reason = errno.ENOTDIR if not folder.is_dir() else errno.EROFS if read_only else errno.EACCES
+        raise OutputFileError(f"{target}: cannot be written: {os.strerror(reason)}. Choose another folder.")
 
 
 def as_path(thing: object) -> Path:

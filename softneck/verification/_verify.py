@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -165,7 +166,12 @@ class Verification(ReprMixin):
 
         `controller` and `observer` are their files; `force` replaces existing loop files.
         """
-        target, files = Path(folder), {}
+        paths = Path(controller), None if observer is None else Path(observer)
+        with _new_files_removed_on_failure(Path(folder)):
+            return self._write_worst(Path(folder), *paths, force)
+
+    def _write_worst(self, target: Path, controller: Path, observer: Path | None, force: bool) -> dict[int, Path]:
+        files: dict[int, Path] = {}
         axes = self.controller.robot.outputs.names
         for number, verdict in enumerate(self.verdicts):
             worst, name = dict(verdict.worst), verdict.requirement.metric.replace(".", "_")
@@ -176,13 +182,28 @@ class Verification(ReprMixin):
                     "axis": axes.index(worst["axis"]) if worst["axis"] in axes else 0,
                 }  # fmt: skip
                 files[number] = write_linear(
-                    target, name, facts, controller=Path(controller), asked=self.requirements,
+                    target, name, facts, controller=controller, asked=self.requirements,
                     block=self.controller.block, weights=self.necks[0].weights, force=force,
                 )  # fmt: skip
             elif worst.get("kind") == "neck":
-                paths = Path(controller), None if observer is None else Path(observer)
+                paths = controller, observer
                 files[number] = write_neck(target, name, worst, *paths, robot=self.controller.robot, force=force)
         return files
+
+
+@contextmanager
+def _new_files_removed_on_failure(folder: Path) -> Iterator[None]:
+    """Remove the files that were added to a folder inside, and the folder if it is new, where an error ends it."""
+    known = set(folder.iterdir()) if folder.is_dir() else set[Path]()
+    try:
+        yield
+    except BaseException:
+        for path in set(folder.iterdir()) - known if folder.is_dir() else ():
+            path.unlink(missing_ok=True)
+        if not known:
+            with suppress(OSError):  # it holds what others put there, or was never made
+                folder.rmdir()
+        raise
 
 
 def with_robot(thing: Any, robot: Robot) -> Any:

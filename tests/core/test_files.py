@@ -65,6 +65,21 @@ def test_a_path_below_a_file_cannot_be_written(tmp_path: Path) -> None:
         write_archive(tmp_path / "file" / "x.npz", {}, {})
 
 
+def test_where_nothing_can_be_written_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    refuse_existing(tmp_path / "new" / "deep" / "x.npz", force=False)
+    with pytest.raises(OutputFileError, match=r"x\.npz: cannot be written: Not a directory\. Choose another folder"):
+        refuse_existing(tmp_path / "file" / "x.npz", force=True)
+    # Root may write everywhere, so that modes of folders say nothing where tests run.
+    monkeypatch.setattr(os, "access", lambda path, _mode: Path(path) != tmp_path)
+    for target in (tmp_path / "x.npz", tmp_path / "new" / "deep" / "x.npz"):
+        with pytest.raises(OutputFileError, match=r"x\.npz: cannot be written: Permission denied"):
+            refuse_existing(target, force=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
 def test_a_folder_that_takes_no_files_is_one_clear_error() -> None:
     # Root may write everywhere but not into /proc.
     with pytest.raises(OutputFileError, match="cannot be written"):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -556,7 +558,9 @@ def test_further_values_of_a_metric_are_appended_each_with_its_own_facts() -> No
     assert [found.describe(row)["row"] for row in range(6)] == [0, 1, 2, 3, 5, 6]
 
 
-def test_the_worst_plant_of_each_requirement_is_written_as_what_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_worst_plant_of_each_requirement_is_written_as_what_it_is(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     written: list[Any] = []
     monkeypatch.setattr(_verify, "write_linear", lambda *args, **more: written.append((args, more)) or Path("linear"))
     monkeypatch.setattr(_verify, "write_neck", lambda *args, **more: written.append((args, more)) or Path("neck"))
@@ -578,6 +582,21 @@ def test_the_worst_plant_of_each_requirement_is_written_as_what_it_is(monkeypatc
     assert written[2][0][2:] == ({"kind": "neck", "name": "k"}, Path("c.npz"), Path("o.npz"))
     found.write_worst("to", controller="c.npz")
     assert written[-1][0][-1] is None
+
+    def full(folder: Path, name: str, *_args: Any, **_more: Any) -> Path:
+        folder.mkdir(exist_ok=True)
+        (folder / f"{name}.py").write_text("a plant without its loop")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    # On a full disk files of others stay, and what the call began is removed.
+    monkeypatch.setattr(_verify, "write_linear", full)
+    for known in ([], ["mine.toml"]):
+        for name in known:
+            (tmp_path / "full").mkdir()
+            (tmp_path / "full" / name).write_text("")
+        with pytest.raises(OSError, match="No space left"):
+            found.write_worst(tmp_path / "full", controller="c.npz")
+        assert [path.name for path in tmp_path.rglob("*")] == (["full", *known] if known else [])
 
 
 # -- controllers, plants and their conditions -------------------------------------------------------------------------
