@@ -56,12 +56,6 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.freeze()
 
 
-def pytest_runtest_setup() -> None:
-    """Do so again once a run on drives has made all objects the collector's at its end."""
-    if not gc.get_freeze_count():
-        gc.freeze()
-
-
 def pytest_sessionfinish() -> None:
     """Give all back: what Python does not collect at its end, libraries take for leaks of theirs."""
     gc.unfreeze()

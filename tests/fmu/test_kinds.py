@@ -15,10 +15,10 @@ from softneck.fmu import build_fmu
 from softneck.runtime import Block, load_runtime
 
 from ..data import slow_but
-from .every_kind import FAMILIES, KINDS, MOTORS, TS, as_block, block_of, inputs_of, recording
+from .every_kind import KINDS, MOTORS, SHORT, TS, as_block, block_of, inputs_of, recording
 
 
-@pytest.fixture(scope="module", params=slow_but(KINDS, FAMILIES))
+@pytest.fixture(scope="module", params=slow_but(KINDS, SHORT))
 def kind(request: pytest.FixtureRequest) -> str:
     return request.param
 

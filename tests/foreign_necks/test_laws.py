@@ -144,7 +144,7 @@ def test_tendons_pull_along_the_gradient_of_their_length(name: str) -> None:
             assert abs((lengths[0] - lengths[1]) / 2e-6 - slope) < 1e-9
 
 
-@pytest.mark.parametrize("name", sorted(WITHOUT_HYSTERESIS))
+@pytest.mark.parametrize("name", slow_but(sorted(WITHOUT_HYSTERESIS), ["foam"]))
 def test_hysteresis_lags_and_never_leads(name: str) -> None:
     def gap(neck: ForeignNeck) -> float:
         U = np.zeros((2000, 8))
