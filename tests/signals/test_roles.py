@@ -339,7 +339,7 @@ def test_the_reported_logs_are_read_as_their_readme_says(
 # How other loggers write the titles of one robot: kilovolts in, micrometres out.
 STYLES = (
     ("t [s]", "U_cmd [kV]", "tip [µm]"), ("t (s)", "U_cmd (kV)", "tip (um)"), ("t/s", "U_cmd / kV", "tip / μm"),
-    ("t_s", "U_cmd_kV", "tip_um"), ("t [s]", "Ucmd[kV]", "tip[µm]"),
+    ("t in s", "U cmd in kV", "tip in µm"), ("t_s", "U_cmd_kV", "tip_um"), ("t [s]", "Ucmd[kV]", "tip[µm]"),
 )  # fmt: skip
 
 

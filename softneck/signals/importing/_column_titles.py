@@ -116,9 +116,11 @@ TEMPERATURES = {"c", "degc", "°c", "degf", "°f", "f", "k"}
 # What stands where a unit would, and is none: an encoder's counts, numbers without a unit.
 _NO_UNITS = {"", "-", "1", "counts", "count", "ticks", "inc", "lsb", "raw", "a.u.", "au", "n/a"}
 # `_V` and `_kPa` at the end of a title; in lower case some are words.
-_CAPITAL = re.compile(r"[_ ]([mku]?[VAN]|[mk]?W|[mk]?Nm|Pa|kPa|hPa|MPa|mmHg|degC|°C)$")
+_CAPITAL = re.compile(r"[_ ]([mku]?[VAN]|[mk]?W|[mk]?Nm|Pa|kPa|hPa|MPa|mmHg|degC|°C?)$")
 # `setpoint / rad`, as DIN 1313 writes units of axes.
 _SLASH = re.compile(r"\s/\s*(\S+)\s*$")
+# `Druck in bar`; `end in mind` names no unit.
+_IN = re.compile(r"\s+in\s+(.+?)\s*$")
 _BRACKET = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
 # `position[0]` of ROS and `u(:,1)` of MATLAB are motor numbers, not units.
 _INDEX = re.compile(r":?,?\s*\d+")
@@ -205,7 +207,9 @@ def ambiguity(title: Title, titles: Iterable[str | int]) -> str:
 
 def _without_unit(title: str) -> tuple[str, str]:
     """Return a title without its unit, and the unit as it is written."""
-    match = _BRACKET.search(title) or _SLASH.search(title) or _CAPITAL.search(title)
+    said = _IN.search(title)
+    last = said if said is not None and spelled_unit(said[1]) else _CAPITAL.search(title)
+    match = _BRACKET.search(title) or _SLASH.search(title) or last
     if match is None or _INDEX.fullmatch(match[1].strip()):
         return title, ""
     text = match[1].strip()
