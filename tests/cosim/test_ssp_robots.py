@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
+import zipfile
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from softneck.core import SettingsError
-from softneck.cosim import load_ssp, make_loop, simulate, write_ssp
+from softneck.core import FileFormatError, SettingsError
+from softneck.cosim import LoopSetup, load_loop, load_ssp, make_loop, simulate, write_ssp
 from softneck.cosim.loops._loop_file import reference_of
 from softneck.cosim.loops._write_ssp import Component, system_description
 from softneck.design import design_controller
@@ -52,16 +54,44 @@ def test_the_reference_of_another_robots_loop_becomes_a_block(tmp_path: Path) ->
         reference_of(file, robot=str(tank))
 
 
-def test_an_archive_is_of_the_robot_beside_it_and_its_fmus_say_whose_they_are(tmp_path: Path) -> None:
+def archive_of_an_antagonist(folder: Path) -> tuple[LoopSetup, Path]:
     model = plant(Robot.preset("antagonist"))
     loop = make_loop({
         "duration_s": 1.0, "order": "jacobi", "plant": model, "controller": design_controller("pi", model),
         "reference": {"kind": "step", "pitch_deg": 5.0, "at_s": 0.1},
     })  # fmt: skip
-    archive = write_ssp(loop, tmp_path / "loop.ssp", compiled=False)
+    return loop, write_ssp(loop, folder / "loop.ssp", compiled=False)
+
+
+def with_annotation(archive: Path, target: Path, new: str) -> Path:
+    """Write an archive with another robot in its annotation."""
+    with zipfile.ZipFile(archive) as whole, zipfile.ZipFile(target, "w") as other:
+        for name in whole.namelist():
+            data = whole.read(name)
+            other.writestr(name, re.sub(rb"<Robot>.*?</Robot>", new.encode(), data) if name.endswith(".ssd") else data)
+    return target
+
+
+def test_an_archive_and_its_fmus_say_whose_they_are(tmp_path: Path) -> None:
+    loop, archive = archive_of_an_antagonist(tmp_path)
     with pytest.raises(SettingsError, match=r"FMU of robot `antagonist` .* the loop of robot `neck`"):
-        load_ssp(archive)
-    (tmp_path / "robot.toml").write_text(preset_text("antagonist"))
-    read, made = simulate(load_ssp(archive)), simulate(loop)  # pyright: ignore[reportArgumentType]
-    np.testing.assert_array_equal(read["pitch"], made["pitch"])
-    assert read.metrics == made.metrics
+        load_loop(archive, robot="neck")
+    made = simulate(loop)
+    # By its own annotation, and, as one without it, by the robot file beside it.
+    (tmp_path / "beside").mkdir()
+    bare = with_annotation(archive, tmp_path / "beside" / "loop.ssp", "")
+    with pytest.raises(SettingsError, match=r"FMU of robot `antagonist` .* the loop of robot `neck`"):
+        load_ssp(bare)
+    (tmp_path / "beside" / "robot.toml").write_text(preset_text("antagonist"))
+    for path in (archive, bare):
+        read = simulate(load_ssp(path))  # pyright: ignore[reportArgumentType]
+        np.testing.assert_array_equal(read["pitch"], made["pitch"])
+        assert read.metrics == made.metrics
+
+
+def test_a_damaged_annotation_is_one_line(tmp_path: Path) -> None:
+    _, archive = archive_of_an_antagonist(tmp_path)
+    for number, text in enumerate(("{", "[1]", '{"name": "a"}', "[" * 100_000, '{"motors": {"names": 3}}')):
+        damaged = with_annotation(archive, tmp_path / f"{number}.ssp", f"<Robot>{text}</Robot>")
+        with pytest.raises(FileFormatError, match=rf"{number}\.ssp: its SystemStructure\.ssd has no robot in"):
+            load_ssp(damaged)

@@ -129,7 +129,8 @@ def _load_ssp_loop(
             f"{source}: is no closed loop of one plant with connected set-points, one controller and one reference; "
             "`softneck simulate` runs it, and `load_ssp` returns it as a system."
         )
-    table = {**read.table, **(keys or {}), "robot": find_robot(robot, beside=source)}
+    whose = read.table.get("robot") if robot is None else None
+    table = {**read.table, **(keys or {}), "robot": whose or find_robot(robot, beside=source)}
     try:
         setup = _setup(table, source.parent)
     except SoftneckError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -59,11 +60,13 @@ class Connection:
 
 
 def system_description(
-    name: str, components: Sequence[Component], links: Sequence[Connection], *, step: float, duration: float
-) -> bytes:
+    name: str, components: Sequence[Component], links: Sequence[Connection], *, step: float, duration: float,
+    robot: Robot | None = None,
+) -> bytes:  # fmt: skip
     """Return the XML text of a system of `components`, stepped by `step` [s] for `duration` [s].
 
-    SSP prescribes no master; annotations of OMSimulator and of softneck describe one with the results of softneck.
+    SSP prescribes no master; annotations of OMSimulator and of softneck describe one with the results of softneck. That
+    of softneck has the `robot` too, if it is not the neck.
     """
     root = Element(
         "ssd:SystemStructureDescription", {**_SPACES, "version": "1.0", "name": name, "generationTool": "softneck"}
@@ -84,7 +87,9 @@ def system_description(
     SubElement(SubElement(_omsimulator(notes), "oms:SimulationInformation"), "oms:FixedStepMaster", settings)
     # After that of OMSimulator, which reads only the first annotation.
     note = SubElement(notes, "ssc:Annotation", {"type": "softneck"})
-    SubElement(note, "Master", {"order": "jacobi", "stepSize": repr(step)})
+    master_note = SubElement(note, "Master", {"order": "jacobi", "stepSize": repr(step)})
+    if robot is not None and robot.in_header():  # below, as the schema has one element in an annotation
+        SubElement(master_note, "Robot").text = json.dumps(robot.as_dict())
     _units(root, "ssd", [port for item in components for port in (*item.inputs, *item.outputs)])
     experiment = SubElement(root, "ssd:DefaultExperiment", {"startTime": "0", "stopTime": repr(duration)})
     # Without this OMSimulator reports the file as deprecated.
@@ -243,7 +248,8 @@ def write_ssp(loop: Loop | LoopSetup | System, path: str | Path, *, force: bool 
     with tempfile.TemporaryDirectory(prefix="softneck-ssp-") as folder:
         sources = {name: _fmu_of(name, part, Path(folder), compiled, plain.robot) for name, part in plain.parts.items()}
         parts = [_component(name, part, sources[name], plain, wiring) for name, part in plain.parts.items()]
-        text = system_description(target.stem, parts, _links(plain, wiring), step=step, duration=plain.duration)
+        links, duration, robot = _links(plain, wiring), plain.duration, plain.robot if closed else None
+        text = system_description(target.stem, parts, links, step=step, duration=duration, robot=robot)
         members = {"SystemStructure.ssd": text}
         members |= {parameter_file(item): parameter_set(item) for item in parts if item.values}
         members |= {f"resources/{source.name}": source.read_bytes() for source in sources.values()}

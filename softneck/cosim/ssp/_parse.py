@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
@@ -9,7 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
-from softneck.core import FileFormatError
+from softneck.core import FileFormatError, SoftneckError, error_reason
+from softneck.robot import Robot
 
 SSD, SSC, SSV, SSM = (
     f"{{http://ssp-standard.org/SSP1/SystemStructure{name}}}"
@@ -110,7 +112,10 @@ class SystemNode:
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """The content of `SystemStructure.ssd`: `stop` [s] of the experiment, `step` [s] and `order` of the master."""
+    """The content of `SystemStructure.ssd`: `stop` [s] of the experiment, `step` [s] and `order` of the master.
+
+    `robot`: of softneck's annotation, None without one.
+    """
 
     name: str
     root: SystemNode
@@ -118,6 +123,7 @@ class Structure:
     stop: float | None
     step: float | None
     order: str | None
+    robot: Robot | None = None
 
 
 class StructureReader:
@@ -150,6 +156,7 @@ class StructureReader:
             stop=span,
             step=step,
             order=order,
+            robot=self._robot(root),
         )
 
     def file(self, source: str) -> Path:
@@ -207,6 +214,17 @@ class StructureReader:
             if element.tag.endswith("}FixedStepMaster") and element.get("stepSize"):
                 return self._positive("stepSize", element.get("stepSize", "")), None
         return None, None
+
+    def _robot(self, root: ET.Element) -> Robot | None:
+        notes = (note for note in root.iter(f"{SSC}Annotation") if note.get("type") == "softneck")
+        text = next((note.findtext("Master/Robot") for note in notes), None)
+        if text is None:
+            return None
+        try:
+            return Robot.from_dict(json.loads(text))
+        except (SoftneckError, ValueError, TypeError, RecursionError) as error:
+            why = f"has no robot in its annotation ({error_reason(error)})"
+            raise self._wrong("SystemStructure.ssd", why) from error
 
     def _system(self, node: ET.Element, depth: int = 0) -> SystemNode:
         if depth > _MAX_DEPTH:

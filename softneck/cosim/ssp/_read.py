@@ -364,6 +364,8 @@ class _TableBuilder:
                 for (path, name), ((origin, output), line) in self.flat.links.items()
             },
         }
+        if self.structure.robot is not None:
+            table["robot"] = self.structure.robot
         step = self._step()
         for path, component in self.flat.components.items():
             part = {
