@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from softneck.core import DataError, Matrix, Vector
 from softneck.robot import TIME_CONSTANT as NECK_SECONDS
-from softneck.robot import Robot
+from softneck.robot import Robot, Scaling
 from softneck.signals import BANDWIDTH, SAMPLE_TIME, Recording, signal
 
 if TYPE_CHECKING:
@@ -179,6 +179,8 @@ def _low_pass_columns(U: Matrix, pole: float, late: int, run: int, runs: int) ->
     return np.column_stack([X, np.ones(len(X)), starts])
 
 
+#: The tests of section 4, which the paper's models never saw.
+PAPER_TESTS = ("steps", "sine", "rotation")
 # The part of the signal `mixed` that moves one tendon at a time, as shares of its length.
 _SINGLE_TENDON_SHARE = (0.88, 0.95)
 # Length of `mixed` for a motion of one second: two thirds of the motion then move one tendon at a time.
@@ -210,18 +212,44 @@ def _set_points(name: str, seconds: float, seed: int) -> Matrix:
 
 def _map_to_training(train: Recording, motion: Matrix) -> Recording:
     """Map a neck's set-points (time, 3) at 20 ms to the mean, covariance, range and speed of the training."""
-    Ts, first = train.sample_time, train.runs()[0]
-    P = on_motors(motion, train.set_points.shape[1])
-    rows = np.arange(0.0, len(P) - 1.0, Ts / (SAMPLE_TIME * _slowness(train)))
-    P = np.column_stack([np.interp(rows, np.arange(len(P)), column) for column in P.T])
-    U = train.set_points
+    slowness, U = _slowness(train), train.set_points
+    P = _resampled(motion, train, slowness)
     P = U.mean(axis=0) + (P - P.mean(axis=0)) @ _covariance_power(P, -0.5) @ _covariance_power(U, 0.5)
-    P = np.clip(P, *np.quantile(U, _RANGE_QUANTILES, axis=0))
-    share = np.linspace(0.0, 1.0, max(round(_RAMP_S * _slowness(train) / Ts), 2))[:, None]
+    return _from_start(train, np.clip(P, *np.quantile(U, _RANGE_QUANTILES, axis=0)), slowness)
+
+
+def make_paper_tests(train: Recording) -> list[Recording]:
+    """Generate the paper's steps, sine and rotation in the units and time of a robot, with NaN outputs after the start.
+
+    They begin at its rest and stay within the set-points of the training. Those of a neck are the paper's own.
+    """
+    scaling = Scaling.of(train.robot, set_points=train.set_points, time_constant=time_constant_of(train))
+    low, high = np.quantile(train.set_points, _RANGE_QUANTILES, axis=0)
+    rest, found = np.clip(scaling.motor_rest, low, high), []
+    for name in PAPER_TESTS:
+        P = _resampled(signal(name).set_points, train, scaling.second)
+        # A motor that was recorded to one side of its rest alone moves to that side.
+        up, down = (np.maximum(side, 1e-9) for side in (P.max(axis=0), -P.min(axis=0)))
+        most = np.maximum((high - rest) / up, (rest - low) / down)
+        P = np.clip(rest + np.minimum(scaling.motor_unit, most) * P, low, high)
+        found.append(_from_start(train, P, scaling.second))
+    return found
+
+
+def _resampled(motion: Matrix, train: Recording, slowness: float) -> Matrix:
+    """Return a neck's set-points (time, 3) at 20 ms, slowed down, for the motors and the sample time of a training."""
+    P = on_motors(motion, train.set_points.shape[1])
+    rows = np.arange(0.0, len(P) - 1.0, train.sample_time / (SAMPLE_TIME * slowness))
+    return np.column_stack([np.interp(rows, np.arange(len(P)), column) for column in P.T])
+
+
+def _from_start(train: Recording, P: Matrix, slowness: float) -> Recording:
+    """Return set-points `P` (time, motors) after a way there from the first row of the training, which has outputs."""
+    Ts, first, robot = train.sample_time, train.runs()[0], train.robot
+    share = np.linspace(0.0, 1.0, max(round(_RAMP_S * slowness / Ts), 2))[:, None]
     U = np.vstack([first.set_points[0] + share * (P[0] - first.set_points[0]), P])
     Y = np.full((len(U), train.outputs.shape[1]), np.nan)
     Y[0] = np.nan_to_num(first.outputs[0])
-    robot = train.robot
     channels = dict(zip((*robot.set_points, *robot.outputs.names), (*U.T, *Y.T), strict=True))
     return Recording(np.arange(len(U)) * Ts, Ts, channels, robot=robot)
 

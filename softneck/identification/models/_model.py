@@ -432,12 +432,12 @@ def _examined_lines(found: Mapping[str, Any], unit: str) -> list[str]:
     if not found:
         return []
     worst = f"{percent(found['fit'])} % at its worst ({found['part']}, {found['output']})"
+    lacks = f": one motion is too little to say more; {found['record']}" if found.get("record") else ""
     if found["low"] is None:
-        return [f"simulation fit {worst}"]
+        return [f"simulation fit {worst}{lacks}"]
     expected = (
         f"simulation fit on other motions {found['expected']:.0f} % ({found['low']:.0f} to {found['high']:.0f} %)"
     )
-    lacks = f": one motion is too little to say more; {found['record']}" if found.get("record") else ""
     lines = [f"{expected}, {worst}{lacks}"]
     if bounds := found.get("bounds"):
         least, wide = min(bounds["held_pct"].values()), max(bounds["width"].values())

@@ -46,7 +46,7 @@ from ..structured._greybox import as_found
 from ..uncertainty._guarded import BASES, OF, Guarded, fitted_base
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
-from ._examination import HOLD_OUT, SECOND, SHORT, Examination, Fits, second_training, unseen_rows
+from ._examination import HOLD_OUT, POOR_FIT_PCT, SECOND, SHORT, Examination, Fits, second_training, unseen_rows
 
 EXAM, COLD = "agreement", "cold start"
 # What is in a model file but was not found from data: sizes, tables, copies of rows in another order; and what says how
@@ -118,8 +118,6 @@ def _mean(fits: Mapping[str, float | None]) -> float:
 
 # Fits closer than this are alike [points]: seeds of noise and training move them by as much.
 ALIKE = 0.5
-# Below this [%] no kind has understood the recording.
-_POOR_FIT_PCT = 70.0
 
 
 def _failure_reasons(ranking: Sequence[KindTrial]) -> str:
@@ -181,9 +179,9 @@ def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[st
             "motions. Give a second recording with another signal; the last one is held out."
         )
     # Of the rows held out alone: motions that were left out may lie far outside what was trained on.
-    if not any(one.hold_out_fit >= _POOR_FIT_PCT for one in ranking):
+    if not any(one.hold_out_fit >= POOR_FIT_PCT for one in ranking):
         remarks.append(
-            f"No kind reaches {_POOR_FIT_PCT:g} % in simulation of the rows held out. Look for a drifting sensor, a "
+            f"No kind reaches {POOR_FIT_PCT:g} % in simulation of the rows held out. Look for a drifting sensor, a "
             "wrong sample time or sign, motors that were not logged, or an excitation that hardly moves the robot."
         )
     failed = [one.kind for one in ranking if one.fit == float("-inf")]
