@@ -171,8 +171,8 @@ def fits_to_reference(model: Model, again: Model, fold: Fold) -> tuple[str, Fits
     """Return the kind that stands for the robot on the paper's tests, and the fits to be expected there [%].
 
     It is the first that has understood the recording and whose squared error on what the fold leaves out is at most
-    half that of `again`, the short form of `model`; "" if there is none. How far a model is from it and how far it is itself from the robot are independent
-    errors, whose squares add.
+    half that of `again`, the short form of `model`; "" if there is none. How far a model is from it and how far it is
+    itself from the robot are independent errors, whose squares add.
     """
     own = _least_fit(again, fold)
     for kind, settings in REFERENCES.items():
