@@ -14,6 +14,7 @@ from softneck.robot import TIME_CONSTANT, Robot, Scaling
 
 from ..recording._recording import Recording
 from ._channel_faults import ChannelQuality, Segment, check_channel, count_rows
+from ._drift import Drift, find_drifts
 from ._excitation import BANDWIDTH, Spectrum, correlation, independent_motions, lightly_damped, spectrum
 from ._followed import Mode
 
@@ -68,6 +69,7 @@ class Quality(ReprMixin):
         directions: number of directions of the set-points, by `independent_motions`.
         correlation: (motors, motors) of the set-points.
         modes: output -> its lightly damped mode, if it has one that the motors excite.
+        drifts: output -> its drift, if it has one.
     """
 
     robot: Robot
@@ -78,6 +80,7 @@ class Quality(ReprMixin):
     directions: int
     correlation: Matrix
     modes: dict[str, Mode]
+    drifts: dict[str, Drift]
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -87,6 +90,11 @@ class Quality(ReprMixin):
         for name, mode in self.modes.items():
             said = f"is lightly damped: the motors make it {mode}."
             found.append(Finding("note", "damping", name, said, "Identify it with two poles or more."))
+        for name, drift in self.drifts.items():
+            change = _value(self.channels[name], drift.change)
+            said = f"drifts by {change} in its longest run, {100.0 * drift.share:.0f} % of its other motion."
+            advice = "No model over the motors follows that: find its cause, and record again."
+            found.append(Finding("warning", "drift", name, said, advice))
         topics = {finding.topic for finding in found if finding.severity != "ok"}
         moved, bandwidth = ", ".join(self.spectrum.inputs), self.spectrum.bandwidth
         clean = _CLEAN | {"excitation": f"{moved} move up to the bandwidth of {bandwidth:.3g} rad/s."}
@@ -111,6 +119,10 @@ class Quality(ReprMixin):
             "correlation": {"channels": self.robot.set_points, "matrix": self.correlation},
             "modes": {
                 name: {"frequency_rad_s": mode.frequency, "damping": mode.damping} for name, mode in self.modes.items()
+            },
+            "drifts": {
+                name: {"change": self.channels[name].in_file_unit(drift.change), "share": drift.share}
+                for name, drift in self.drifts.items()
             },
         }
 
@@ -175,6 +187,7 @@ def assess_quality(recording: Recording, *, bandwidth: float | None = None) -> Q
         directions=independent_motions(recording),
         correlation=correlation(recording),
         modes=lightly_damped(recording),
+        drifts=find_drifts(recording),
     )
 
 
@@ -183,6 +196,7 @@ _CLEAN = {
     "frozen": "no channel is constant while its input moves.",
     "clipping": "no channel has flat tops.",
     "outliers": "no spikes in outputs and motor positions.",
+    "drift": "no output drifts on its own.",
     "quantisation": "every channel has more than 100 levels in its range.",
     "directions": "the motors move in as many directions as there are.",
     "correlation": "the motors move independently enough.",
