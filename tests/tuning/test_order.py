@@ -1842,6 +1842,27 @@ def test_what_is_relaxed_is_verified_again_by_draws_of_its_own(monkeypatch: pyte
     assert relaxed(monkeypatch, [rising("pi", margins=True)], {}, 2)[1] == []
 
 
+def test_what_the_draws_of_the_next_certificate_miss_is_relaxed_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, steady = make_tune_requirements({}), {"sim.steady_rms_deg": _compare.Loosened(0.15, 0.2, 0.22)}
+    task = replace(task_of({"n": linear_neck()}, {}, 0), asked=asked)
+    made: list[tuple[set[str], int]] = []
+
+    def again(task: Any, made_before: Any, _: Any, attempt: int) -> Any:
+        wider = {name for name in (*RELAXED, *steady) if task.asked.limit(name) != asked.limit(name)}
+        made.append((wider, attempt))
+        failed = ["steady"] if wider == set(RELAXED) else []
+        return replace(made_before, verification=SimpleNamespace(holds=not failed, failed=failed))
+
+    monkeypatch.setattr(_tune, "relaxations", lambda _, failed, __: steady if failed == ["steady"] else RELAXED)
+    monkeypatch.setattr(_tune, "certify_again", again)
+    item, first = rising("pi"), SimpleNamespace(holds=False, failed=["rise"])
+    found: Any = _Found(task, item, first, candidates=(item,), controller=None)
+    best: Any = _certify.Certified(item, None, False, first, {})  # pyright: ignore[reportArgumentType]
+    relaxed: Any = _tune._relax(found, best, 1, None, lambda *_: None)
+    assert made == [(set(RELAXED), 2), ({*RELAXED, *steady}, 3)]
+    assert relaxed.loosened == RELAXED | steady
+
+
 def test_what_its_search_relaxed_is_verified_once_and_told_as_asked_where_nothing_holds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

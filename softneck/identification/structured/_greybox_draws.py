@@ -88,6 +88,10 @@ class GreyBoxDraws:
         """Return a draw: a standard normal number for each of the grey box's, and one for the dead time."""
         return rng.standard_normal(len(self.problem.numbers) + 1)
 
+    def smoother(self) -> list[GreyBoxDraws]:
+        """Return this alone: its prior holds what the recordings do not tell."""
+        return [self]
+
     def arrays(self, draw: Vector, factor: float) -> dict[str, Matrix]:
         """Return the arrays of a draw whose deviations are `factor` times those of the fitted numbers."""
         delay, x = self._centre(float(draw[-1]), factor)

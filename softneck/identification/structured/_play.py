@@ -55,6 +55,14 @@ class PlayStructure:
             rows += [list(three) for three in combinations_with_replacement(late[: self.tilts], 3)]
         return np.array(rows, dtype=np.float64)
 
+    @property
+    def chains(self) -> np.ndarray:
+        """(inputs, chains, n) which terms are those of each chain of an input, the one without a play first."""
+        chains = self.inputs * (1 + len(self.widths))
+        places = np.arange(len(self.table)) - 1
+        of = np.where((places >= 0) & (places < chains * self.order), places // self.order, -1)
+        return (of == np.arange(chains)[:, None]).reshape(self.inputs, -1, places.size)
+
     def chain(self, sample_time: float) -> Vector:
         """(2,) pole and order, as the runtime reads them."""
         return np.array([np.exp(-self.rate * sample_time), float(self.order)])
@@ -119,18 +127,54 @@ def _groups(lengths: list[int]) -> list[np.ndarray]:
     return [np.concatenate([np.arange(n) >= (1.0 - HOLD_OUT) * n for n in lengths])]
 
 
-def ridge(X: Matrix, Y: Matrix, weight: float) -> Matrix:
-    """Return W (outputs, n) that minimises `|Y - X W'|^2 / rows + weight |w|^2`, w of standardised terms."""
+def ridge(X: Matrix, Y: Matrix, weight: float, chains: np.ndarray | None = None) -> Matrix:
+    """Return W (outputs, n) that minimises `|Y - X W'|^2 / rows + weight |w|^2`, w of standardised terms.
+
+    `chains` (inputs, chains, n): none has a static gain of another sign than all of its input; see `rising`.
+    """
+    mean, scale, A = _normal(X, weight)
+    W = np.linalg.solve(A, ((X - mean) / scale).T @ Y) / scale[:, None]
+    W[0] -= mean @ W
+    return W.T if chains is None else rising(W.T, spread_of(X, weight), chains)
+
+
+def _normal(X: Matrix, weight: float) -> tuple[Vector, Vector, Matrix]:
+    """Return mean and scale (n,) of the terms, and the matrix (n, n) of the ridge's normal equations."""
     mean, scale = X.mean(axis=0), X.std(axis=0)
     mean[0], scale[0] = 0.0, 1.0
     scale = np.where(scale > 1e-9, scale, 1.0)
     Z = (X - mean) / scale
     penalty = weight * len(Z) * np.ones(Z.shape[1])
     penalty[0] = 0.0
-    A = Z.T @ Z + np.diag(penalty) + 1e-12 * len(Z) * np.eye(Z.shape[1])
-    W = np.linalg.solve(A, Z.T @ Y) / scale[:, None]
-    W[0] -= mean @ W
-    return W.T
+    return mean, scale, Z.T @ Z + np.diag(penalty) + 1e-12 * len(Z) * np.eye(Z.shape[1])
+
+
+def spread_of(X: Matrix, weight: float) -> Matrix:
+    """Return the covariance (n, n) of a ridge's weights for errors of variance 1."""
+    mean, scale, A = _normal(X, weight)
+    T = np.diag(1.0 / scale)
+    T[0] -= mean / scale
+    return T @ np.linalg.solve(A, T.T)
+
+
+def rising(W: Matrix, spread: Matrix, chains: np.ndarray) -> Matrix:
+    """Return the weights (outputs, n) nearest to W, by their `spread` (n, n), with no chain of negative share.
+
+    A hysteresis of plays with positive shares dissipates; with negative ones small motions would go the wrong way, and
+    a loop with an integrator oscillate (Kuhnen 2003, Eur. J. Control 9:407). `chains`: as for `ridge`.
+    """
+    found = W.copy()
+    for output, w in enumerate(W):
+        held = np.zeros(chains.shape[:2], dtype=bool)
+        while True:
+            sums = chains @ found[output]
+            share = np.where(held, 0.0, sums * np.sign(sums.sum(axis=1, keepdims=True)))
+            if not (share < 0.0).any() or held.all():
+                break
+            held[np.unravel_index(np.argmin(share), share.shape)] = True
+            C = chains[held].astype(float)
+            found[output] = w - spread @ C.T @ np.linalg.solve(C @ spread @ C.T, C @ w)
+    return found
 
 
 def scores(data: Data, hold_out: Data | None, form: PlayStructure, weights: tuple[float, ...]) -> list[float]:
@@ -148,12 +192,12 @@ def scores(data: Data, hold_out: Data | None, form: PlayStructure, weights: tupl
     else:
         folds = [(X[good], data.outputs[good], hold_out.terms(form)[hold_out.settled],
                   hold_out.outputs[hold_out.settled])]  # fmt: skip
-    return [float(np.mean([_fold_score(fold, weight) for fold in folds])) for weight in weights]
+    return [float(np.mean([_fold_score(fold, weight, form.chains) for fold in folds])) for weight in weights]
 
 
-def _fold_score(fold: tuple[Matrix, Matrix, Matrix, Matrix], weight: float) -> float:
+def _fold_score(fold: tuple[Matrix, Matrix, Matrix, Matrix], weight: float, chains: np.ndarray) -> float:
     X, Y, held, y = fold
-    free = held @ ridge(X, Y, weight).T
+    free = held @ ridge(X, Y, weight, chains).T
     return float(np.mean([nrmse_fit(y[:, axis], free[:, axis]) for axis in range(y.shape[1])]))
 
 
@@ -174,7 +218,7 @@ _FILTER_RATES = (6.0, 15.0)
 _ALL_FILTER_RATES = (4.0, 6.0, 10.0, 15.0, 25.0)
 _PLAY_WIDTHS = ((), (0.3,), (0.1, 0.3, 0.9))
 _POLYNOMIAL_DEGREES = (1, 2, 3)
-_RIDGE_WEIGHTS = (1e-6, 1e-4, 1e-2)
+RIDGE_WEIGHTS = (1e-6, 1e-4, 1e-2)
 # Of forms whose fits on the hold-out differ by less than this [points], that with the fewest terms is taken.
 _FIT_TOLERANCE_PCT = 0.1
 # A held input is forgotten after this: the slowest filter by far is that of the load, some 1.
@@ -288,7 +332,7 @@ class Play:
         if not fitting:
             least = min(len(form.table) for form in forms)
             raise DataError(f"{rows} settled rows are too few for {least} terms; record longer or lower `order`.")
-        ridges = _RIDGE_WEIGHTS if self.ridge is None else (self.ridge,)
+        ridges = RIDGE_WEIGHTS if self.ridge is None else (self.ridge,)
         scored: list[tuple[float, PlayStructure, float]] = []
         for number, form in enumerate(fitting):
             best = f"best fit {max(score for score, _, _ in scored):.1f} %" if scored else "forms"
@@ -307,7 +351,7 @@ def _arrays(data: Data, drive: LoadedDrive, form: PlayStructure, weight: float, 
     good = data.settled
     # Along the simulated motors, as in simulation, and along the logged ones, as in a prediction: one f serves both.
     both = np.concatenate([data.terms(form)[good], data.terms(form, measured=True)[good]])
-    W = ridge(both, np.tile(data.outputs[good], (2, 1)), weight)
+    W = ridge(both, np.tile(data.outputs[good], (2, 1)), weight, form.chains)
     lowest, highest = data.outputs[good].min(axis=0), data.outputs[good].max(axis=0)
     wider = _OUTPUT_MARGIN * (highest - lowest)
     limits = np.column_stack([lowest - wider, highest + wider])

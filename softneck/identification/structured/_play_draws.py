@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from softneck.signals import Recording
 
 from ..models._fitting import ScaledData, training_recording
 from ..models._model import Model
-from ._play import Data, Play, PlayStructure, _arrays, _in_si, ridge
+from ._play import RIDGE_WEIGHTS, Data, Play, PlayStructure, _arrays, _in_si, ridge, rising, spread_of
 
 # Length of a segment [s of a neck's time]: ten of its time constants.
 _SEGMENT_S = 2.0
@@ -28,6 +28,8 @@ class PlayDraws:
         terms, outputs: (rows, terms) and (rows, outputs) from which the weights are learned.
         groups: (rows,) the segment of each row.
         weight: of the ridge.
+        chains: (inputs, chains, terms) which terms are those of each chain.
+        middle, spread: (outputs, terms) weights of all rows, and (terms, terms) their covariance up to a factor.
     """
 
     model: Model
@@ -37,6 +39,9 @@ class PlayDraws:
     outputs: Matrix
     groups: np.ndarray
     weight: float
+    chains: np.ndarray
+    middle: Matrix
+    spread: Matrix
 
     @classmethod
     def fit(cls, recording: Recording, *, settings: Play | None = None, progress: Progress = silent) -> PlayDraws:
@@ -55,10 +60,11 @@ class PlayDraws:
             number = first + np.arange(len(motors)) // length
             groups.append(number)
             first = int(number[-1]) + 1
+        terms, outputs, weight = data.terms(form)[good], data.outputs[good], float(found["ridge"])
         return cls(
-            model=model, scaled=scaled, scaled_arrays=_arrays(data, scaled.drive, form, found["ridge"], settings.echo),
-            terms=data.terms(form)[good], outputs=data.outputs[good], groups=np.concatenate(groups)[good],
-            weight=float(found["ridge"]),
+            model=model, scaled=scaled, scaled_arrays=_arrays(data, scaled.drive, form, weight, settings.echo),
+            terms=terms, outputs=outputs, groups=np.concatenate(groups)[good], weight=weight, chains=form.chains,
+            middle=ridge(terms, outputs, weight), spread=spread_of(terms, weight),
         )  # fmt: skip
 
     def draw(self, rng: np.random.Generator) -> Vector:
@@ -71,9 +77,25 @@ class PlayDraws:
     def arrays(self, draw: Vector, factor: float) -> dict[str, Matrix]:
         """Return the arrays of a draw whose deviations are `factor` times those of the bootstrap."""
         rows = np.repeat(np.arange(self.groups.size), draw[self.groups].astype(int))
-        middle = ridge(self.terms, self.outputs, self.weight)
-        away = ridge(self.terms[rows], self.outputs[rows], self.weight) - middle
-        own = self.scaled_arrays
-        arrays = {**own, "weights": own["weights"] + factor * away}
+        away = ridge(self.terms[rows], self.outputs[rows], self.weight) - self.middle
+        weights = rising(self.scaled_arrays["weights"] + factor * away, self.spread, self.chains)
+        return self._in_si(weights)
+
+    def smoother(self) -> list[PlayDraws]:
+        """Return this with each larger weight of the ridge, the largest first, and this itself last."""
+        larger = sorted((weight for weight in RIDGE_WEIGHTS if weight > self.weight), reverse=True)
+        return [*map(self._with_ridge, larger), self]
+
+    def _with_ridge(self, weight: float) -> PlayDraws:
+        middle, spread = ridge(self.terms, self.outputs, weight), spread_of(self.terms, weight)
+        weights = rising(self.scaled_arrays["weights"] + middle - self.middle, spread, self.chains)
+        findings = {**self.model.findings, "ridge": weight}
+        model = replace(self.model, arrays={**self.model.arrays, **self._in_si(weights)}, findings=findings)
+        arrays = {**self.scaled_arrays, "weights": weights}
+        return replace(self, model=model, scaled_arrays=arrays, weight=weight, middle=middle, spread=spread)
+
+    def _in_si(self, weights: Matrix) -> dict[str, Matrix]:
+        """Return scaled weights (outputs, terms) as the array of a draw."""
+        arrays = {**self.scaled_arrays, "weights": weights}
         found = arrays if self.scaled.scaling.is_identity else _in_si(arrays, self.scaled.scaling)
         return {"weights": found["weights"]}

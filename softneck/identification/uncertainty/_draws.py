@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import product
 from typing import Any, Protocol
 
@@ -69,6 +69,7 @@ class Source(Protocol):
     def model(self) -> Model: ...
     def draw(self, rng: np.random.Generator) -> Vector: ...
     def arrays(self, draw: Vector, factor: float) -> dict[str, Matrix]: ...
+    def smoother(self) -> Sequence[Source]: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
@@ -203,8 +204,9 @@ def make_draws(
     Models are fitted to the first three quarters of each run: for robots that tendons bend the grey box without and
     with its optional parts, else kind `play`. What the nearest draw leaves over of the last quarters, less the sensor's
     noise, is a disturbance. The model is the one that, with disturbance and noise, predicts them best, by the
-    continuous ranked probability score (Gneiting and Raftery 2007, J. Am. Stat. Assoc. 102:359); the factor on the
-    deviations of its numbers is the smallest within one standard error of the best (Breiman et al. 1984, sec. 3.4).
+    continuous ranked probability score (Gneiting and Raftery 2007, J. Am. Stat. Assoc. 102:359); of `play` the ridge is
+    the largest and of each the factor on the deviations of its numbers the smallest within one standard error of the
+    best (Breiman et al. 1984, sec. 3.4): plays that hardly a motion tells apart would swing.
     Then the disturbance is raised until the band covers `LEVEL` of the samples at every amplitude. Simulations begin
     20 s of a neck's time before the last quarters.
 
@@ -225,18 +227,26 @@ def make_draws(
     train, held, warm_ups = _split(whole, second)
     sources = _sources(train, lambda done, text: progress(0.4 * done, f"draws: {text}"))
     motions = _Motions.of(held, sources[0].model, second, warm_ups)
-    memory, tried = second / held.sample_time, list[tuple[Vector, Source, float, np.ndarray]]()
-    for number, (source, factor) in enumerate(product(sources, _FACTORS)):
-        progress(0.4 + 0.35 * number / (len(sources) * len(_FACTORS)), f"draws: deviations times {factor:g}")
+    memory = second / held.sample_time
+
+    @cache
+    def judged(source: Source, factor: float) -> tuple[Vector, np.ndarray]:
         rng = np.random.default_rng([seed, 0])
         trial = [source.draw(rng) for _ in range(_CALIBRATION_DRAWS)]
         Y = replace(motions, model=source.model).simulate(_arrays(source, factor, trial))
         loops = motions.disturbed(Y, *motions.disturbance(Y, memory), np.random.default_rng([seed, 2]))
-        tried.append((motions.scores(loops), source, factor, Y))
-    best, winner = min(((scores, source) for scores, source, _, _ in tried), key=lambda item: float(item[0].mean()))
+        return motions.scores(loops), Y
+
+    tried = list[tuple[Vector, Source]]()
+    for number, (source, factor) in enumerate(product(sources, _FACTORS)):
+        progress(0.4 + 0.35 * number / (len(sources) * len(_FACTORS)), f"draws: deviations times {factor:g}")
+        tried.append((judged(source, factor)[0], source))
+    best, winner = min(tried, key=lambda item: float(item[0].mean()))
     if not math.isfinite(float(best.mean())):
         raise DataError("no draw has a finite simulation on the held-out motions; record longer.")
-    _, source, factor, Y = next(item for item in tried if item[1] is winner and _no_worse(item[0], best))
+    options = product(winner.smoother(), _FACTORS)
+    source, factor = next(option for option in options if _no_worse(judged(*option)[0], best))
+    Y = judged(source, factor)[1]
     share, keep = motions.disturbance(Y, memory)
     more = next((more for more in _MORE if motions.covers(Y, more * share, keep)), _MORE[-1])
     rows, rng, sizes = list[dict[str, Matrix]](), np.random.default_rng([seed, 1]), [SEARCH_DRAWS, *[count] * ATTEMPTS]

@@ -8,7 +8,7 @@ import pytest
 from softneck.core import DataError, SettingsError
 from softneck.identification import INFINITE, Model, Play, validate
 from softneck.identification.models._drive import FUNCTIONS, NO_LOAD, LoadedDrive, fit_loaded_drive, fit_noise_model
-from softneck.identification.structured._play import Data, PlayStructure, ridge, scores
+from softneck.identification.structured._play import Data, PlayStructure, ridge, rising, scores, spread_of
 from softneck.runtime import load_functions
 from softneck.signals import Recording, redefinition_matrix
 from softneck.signals.recording._channels import MOTOR_POSITIONS
@@ -119,6 +119,61 @@ def test_ridge_without_weight_is_least_squares_and_a_heavy_one_is_the_mean() -> 
     # The jitter of 1e-12 beside eigenvalues of order one.
     np.testing.assert_allclose(ridge(X, Y, 0.0).T, np.linalg.lstsq(X, Y)[0], rtol=0, atol=1e-9)
     np.testing.assert_allclose(X @ ridge(X, Y, 1e9).T, np.tile(Y.mean(axis=0), (200, 1)), rtol=0, atol=1e-6)
+
+
+def shares(weights: np.ndarray, form: PlayStructure) -> np.ndarray:
+    """The static gain of each chain over that of its input (outputs, inputs, chains)."""
+    sums = np.moveaxis(form.chains @ weights.T, -1, 0)
+    return sums / sums.sum(axis=-1, keepdims=True)
+
+
+def test_the_spread_of_a_ridge_is_the_covariance_of_its_weights() -> None:
+    rng = np.random.default_rng(5)
+    X = np.column_stack([np.ones(300), rng.standard_normal((300, 3)) @ rng.standard_normal((3, 3)) + 2.0])
+    truth = X @ rng.standard_normal((4, 1))
+    found = ridge(X, truth + rng.standard_normal((300, 4000)), 0.0)
+    # 4,000 draws tell a covariance to 1 / sqrt(2000) = 2 % of the variances; the largest of 16 by four of these.
+    scale = np.sqrt(np.diag(spread_of(X, 0.0)))
+    np.testing.assert_allclose(
+        np.cov(found.T) / np.outer(scale, scale), spread_of(X, 0.0) / np.outer(scale, scale), atol=0.09
+    )
+
+
+def test_weights_rise_with_every_chain_and_are_the_nearest_that_do() -> None:
+    rng, form = np.random.default_rng(3), PlayStructure(15.0, 2, (0.3, 0.9), 2, inputs=2, tilts=2)
+    n = len(form.table)
+    assert form.chains.sum() == 2 * 3 * 2, "each linear term is of one chain"
+    root = rng.standard_normal((n, n))
+    spread, moved = root @ root.T + 0.1 * np.eye(n), 0
+    for W in rng.standard_normal((200, 1, n)):
+        found = rising(W, spread, form.chains)
+        if (shares(W, form) >= 0.0).all():
+            np.testing.assert_array_equal(found, W)
+            continue
+        # What is held has a share of rounding alone.
+        assert (shares(found, form) > -1e-9).all()
+        held = form.chains[np.abs(form.chains @ found[0]) < 1e-9].astype(float)
+        # The nearest with these chains at zero, in the null space of their sums.
+        free = np.linalg.svd(held)[2][len(held) :].T
+        metric = np.linalg.inv(spread)
+        expected = free @ np.linalg.solve(free.T @ metric @ free, free.T @ metric @ W[0])
+        np.testing.assert_allclose(found[0], expected, rtol=1e-6, atol=1e-9)
+        moved += 1
+    assert moved > 50
+
+
+def test_a_backlash_wider_than_the_plays_has_no_small_gain_of_the_other_sign() -> None:
+    """Less of the input and more of a narrow play is a wider play: a loop with an integrator would swing within it."""
+    rng, widths = np.random.default_rng(1), (0.3,)
+    v = np.cumsum(0.05 * rng.choice([-1.0, 1.0], 200).repeat(20))
+    v = 3.0 * np.sin(0.8 * v)
+    form = PlayStructure(15.0, 2, widths, 1, inputs=1, tilts=1)
+    wide = bank(np.tile(v[:, None], (1, 3)), [0.6])[:, 1]
+    data = Data([v[:, None]], [v[:, None]], wide[:, None], np.arange(v.size) > 50, [], 0.02, np.ones((1, 1)))
+    X = data.terms(form)[data.settled]
+    plain = ridge(X, data.outputs[data.settled], 1e-6)
+    assert shares(plain, form).min() < -0.1, "otherwise this tells nothing"
+    assert shares(ridge(X, data.outputs[data.settled], 1e-6, form.chains), form).min() > -1e-9
 
 
 @pytest.mark.parametrize("widths", [(), (0.3,), (0.1, 0.3, 0.9)])

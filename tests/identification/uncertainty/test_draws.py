@@ -19,7 +19,7 @@ from scipy.signal import lfilter
 from softneck.core import DataError, FileFormatError, SettingsError, load
 from softneck.identification import Draws, Family, Model, make_draws
 from softneck.identification.models._fitting import sensor_noise
-from softneck.identification.structured._play import Play
+from softneck.identification.structured._play import RIDGE_WEIGHTS, Play
 from softneck.identification.structured._play_draws import PlayDraws
 from softneck.identification.uncertainty import _draws
 from softneck.plant import NeckParameters, VirtualNeck, record
@@ -260,7 +260,7 @@ def test_draws_come_from_the_model_that_predicts_the_held_out_motions_better(
     monkeypatch.setattr(_draws, "_FACTORS", (1.0, 2.0))
     monkeypatch.setattr(_draws, "_CALIBRATION_DRAWS", 10)
     found = make_draws(recordings, count=2)
-    assert found.model is good.model
+    assert found.model.findings["rate"] == good.model.findings["rate"]
     # The numbers are those of this model too.
     assert {name: values.shape[1:] for name, values in found.arrays.items()} == {
         "weights": good.model.arrays["weights"].shape
@@ -596,13 +596,54 @@ def test_the_best_of_all_models_and_factors_is_the_one_of_the_least_mean_score(
     scores: list[list[float]], chosen: int, factor: float, recordings: list[Recording], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     train, told = _draws._split(_draws.concatenate(recordings), 1.0)[0], iter(scores)
-    sources = [PlayDraws.fit(train, settings=each) for each in (QUICK, replace(QUICK, rate=5.0))]
+    most = replace(QUICK, ridge=RIDGE_WEIGHTS[-1])  # none is larger
+    sources = [PlayDraws.fit(train, settings=each) for each in (most, replace(most, rate=5.0))]
     monkeypatch.setattr(_draws, "_sources", lambda *_: sources)
     monkeypatch.setattr(_draws, "_FACTORS", (1.0, 2.0))
     monkeypatch.setattr(_draws, "_CALIBRATION_DRAWS", 4)
     monkeypatch.setattr(_draws._Motions, "scores", lambda *_: np.array(next(told)))
     found = make_draws(recordings, count=2)
     assert (found.model, found.factor) == (sources[chosen].model, factor)
+
+
+@pytest.mark.parametrize(
+    ("scores", "ridge", "factor"),
+    [
+        ([[0.4, 0.4], [0.5, 0.5], [0.3, 0.6]], 1e-2, 1.0),
+        ([[0.4, 0.4], [0.5, 0.5], [0.9, 0.9], [0.3, 0.6]], 1e-2, 2.0),
+        ([[0.4, 0.4], [0.5, 0.5], [0.9, 0.9], [0.9, 0.9], [0.4, 0.4]], 1e-4, 1.0),
+        ([[0.5, 0.5], [0.4, 0.4], [0.9, 0.9], [0.9, 0.9], [0.9, 0.9], [np.inf, 0.1]], 1e-6, 2.0),
+    ],
+)
+def test_of_a_play_model_the_largest_ridge_that_is_no_worse_is_taken(
+    scores: list[list[float]], ridge: float, factor: float, recordings: list[Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train, told = _draws._split(_draws.concatenate(recordings), 1.0)[0], iter(scores)
+    source = PlayDraws.fit(train, settings=replace(QUICK, ridge=1e-6))
+    monkeypatch.setattr(_draws, "_sources", lambda *_: [source])
+    monkeypatch.setattr(_draws, "_FACTORS", (1.0, 2.0))
+    monkeypatch.setattr(_draws, "_CALIBRATION_DRAWS", 4)
+    monkeypatch.setattr(_draws._Motions, "scores", lambda *_: np.array(next(told)))
+    found = make_draws(recordings, count=2)
+    assert (found.model.findings["ridge"], found.factor) == (ridge, factor)
+    assert next(told, None) is None, "no draw is simulated twice"
+
+
+def test_a_smoother_play_model_is_that_of_its_ridge(recordings: list[Recording]) -> None:
+    # Without logged motors a model is learned from the same rows as its draws.
+    train = [
+        replace(part, channels={n: v for n, v in part.channels.items() if "position" not in n}) for part in recordings
+    ]
+    source = PlayDraws.fit(_draws.concatenate(train), settings=replace(QUICK, ridge=1e-6))
+    each_once = np.ones(int(source.groups.max()) + 1)
+    for smoother, ridge in zip(source.smoother(), (1e-2, 1e-4, 1e-6), strict=True):
+        model = PlayDraws.fit(_draws.concatenate(train), settings=replace(QUICK, ridge=ridge)).model
+        # Sums of a thousand rows, taken in another order.
+        np.testing.assert_allclose(smoother.model.arrays["weights"], model.arrays["weights"], rtol=1e-6, atol=1e-9)
+        assert smoother.model.findings["ridge"] == smoother.weight == ridge
+        np.testing.assert_allclose(
+            smoother.arrays(each_once, 3.0)["weights"], smoother.model.arrays["weights"], rtol=1e-9
+        )
 
 
 def test_a_disturbance_goes_by_the_motion_of_the_middle_draw_and_the_first_certificate_is_the_default(
