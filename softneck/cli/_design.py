@@ -21,8 +21,8 @@ _KINDS = "\n".join(f"  {name:9} {KINDS[name].summary}" for name in kinds_of("con
 @click.command(
     "design",
     cls=kind_command("controller"),
-    help="Design a controller of KIND on an identified linear MODEL or a FAMILY; of several files the first is the "
-    "nominal plant and all are samples that the controller must hold on."
+    help="Design a controller of KIND on an identified linear MODEL or a FAMILY; the first of several files is the "
+    "nominal plant, and the controller must hold on all of them."
     f"\n\n\b\nKinds:\n{_KINDS}",
     epilog="Example: softneck design pi rls.npz -o pi.npz --set phase_margin_deg=60",
 )
@@ -98,9 +98,9 @@ def observer_command(
 ) -> None:
     """Build a filter over the identified MODEL.
 
-    The form follows from the model: a Kalman filter over a linear one, with a disturbance on each axis; of a nonlinear
-    one the simulation, with a disturbance. Another: --set form=gyro, driven by the gyro's rates with their bias as a
-    state.
+    The form follows from the model: a Kalman filter over a linear one, with a disturbance on each axis; over a
+    nonlinear one its simulation, with a disturbance. `--set form=gyro` makes a filter that the gyro's rates drive, with
+    their bias as a state.
     """
     kind = find_kind("kalman", "observer")
     path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")

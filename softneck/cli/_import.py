@@ -150,7 +150,7 @@ def command(
     """Turn any logger's table LOG into a recording: by a layout file, a guess at one, or columns that are named.
 
     With --resample alone LOG is a recording. Where the new sample time is slower, measured channels are low-passed
-    first, without a delay; set-points and flags hold their last value. At its own sample time it stays, to the bit.
+    first, without a delay; set-points and flags hold their last value. At its own sample time it is copied unchanged.
 
     Reads text in any encoding, spreadsheets, Parquet, MATLAB files, and ROS 2 bags (.mcap). The .mcap log of
     `softneck drives run --log` needs neither layout nor guess.

@@ -33,7 +33,7 @@ _MOST_NAMES = 3
 def new(folder: Path, loop_file: Path | None, force: bool, as_json: bool) -> None:
     """Write a project into DIR, new or empty: identification, design, loop, study, closed-loop test, drives.
 
-    It is of the virtual neck; `softneck start LOG` makes the one of your own log.
+    The project is for the virtual neck; `softneck start LOG` makes one from your own log.
     """
     project = re.sub(r"[^A-Za-z0-9]+", "-", folder.resolve().name).strip("-").lower() or "neck"
     texts = _texts(project) if loop_file is None else _of_loop(loop_file, folder, project)

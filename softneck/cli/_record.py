@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     "record",
     help="Record SIGNAL on the virtual neck, or on that of a robot.\n\nSignals: "
     + ", ".join(signal_names())
-    + ", or a recording whose set-points are played. A MODEL (guarded): the next experiment, motions on "
-    "which its members disagree, or lead where nothing was seen; REC holds its set-points, and as outputs what they "
-    "expect. Play it with `softneck drives record REC`.",
+    + ", or a recording whose set-points are played. With a MODEL of kind guarded: the next experiment, with "
+    "motions on which its members disagree or that were not recorded yet. REC holds its set-points and the outputs "
+    "that the model expects. Play it with `softneck drives record REC`.",
     epilog="Example: softneck record eq22 -o eq22.csv --neck paper --seed 1",
 )
 @click.argument("signal_name", metavar="SIGNAL|MODEL")

@@ -222,7 +222,7 @@ def study_command(
     DIR gets  runs.csv       a row for each run: what varied, seed, metrics, limits, error
               report.html    ranking, Pareto front, distributions, influences
               worst/         the worst runs as loop files for softneck simulate
-    Ctrl-C or a crash loses no finished run: the same command goes on where it was.
+    Ctrl-C or a crash loses no finished run: the same command continues.
     """
     from softneck.report import failures, study_head, study_page, study_rows
 

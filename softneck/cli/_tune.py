@@ -59,9 +59,9 @@ def command(
               tuner.html             all candidates, chosen by two sliders
               requirements.toml      all requirements, for tune and verify
               evaluations.json       all evaluations: the same command continues from them
-    Defaults of speed and precision that no candidate keeps are loosened to what the best keeps, by a factor of two at
-    most, and the result says so; those of a --requirements file are never loosened. Exit code 1 if no candidate keeps
-    all, with the active requirement.
+    If no candidate meets a default limit of speed or accuracy, the limit becomes the best candidate's value, at most
+    twice the default, and the result says so. Limits of a --requirements file stay. Exit code 1 if no candidate meets
+    all; the line names the requirement that fails.
     """
     from softneck.report import tune_verdict, write_tuned
 

@@ -53,14 +53,12 @@ def command(
 ) -> None:
     """Verify CONTROLLER on every plant of the linear MODELs and FAMILYs, and in loops over simulation models.
 
-    A FAMILY with draws (`softneck family`) decides by loops over these: of 59 none may fail. Its linear tests are then
-    shown beside. Attempts at a certificate over the same FAMILY are counted in it: it tells what the folder has.
+    A FAMILY with draws (`softneck family`) decides by loops over them: none of 59 may fail. Its linear tests are shown
+    beside. The certificate counts how often one was tried over the same FAMILY, by the certificates in its folder.
 
-    Simulation models are nonlinear MODELs, NECKs (a neck file, or a preset by its name) and FMUs: on them margins are
-    found by experiment too. Without any, and without draws, the preset of the requirements is shown, which is a foreign
-    plant and does not decide.
-
-    Of another robot on the virtual plant that its robot.toml names, if it does.
+    Simulation models are nonlinear MODELs, NECKs (a neck file, or a preset by its name) and FMUs. On them margins are
+    also found by experiment. Without any, and without draws, the built-in neck is shown only: it does not decide. For
+    another robot it is the virtual plant that its robot.toml names, if there is one.
 
     Writes a certificate: each requirement with its value, limit and worst plant, and the hashes of all files read;
     beside it a loop file for every worst plant, for `softneck simulate`. Exit code 1 if a requirement does not hold.

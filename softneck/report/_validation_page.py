@@ -169,7 +169,7 @@ def _calibrated_remarks(r: Validation) -> list[str]:
         said = "  ".join("..".join(f"{end / to_si(unit)[0]:.3g}" for end in pair) for pair in ends)
         lines.append(f"beyond the set-points of these records ({said} {unit}) there is no such bound")
     if found["reason"] is not None:
-        lines.append(found["reason"] if lines else f"no calibrated bounds, {found['reason']}")
+        lines.append(found["reason"] if lines else f"no calibrated bounds: {found['reason']}")
     return lines
 
 

@@ -349,10 +349,9 @@ def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
         print_json(facts)
     else:
         for sort, model in facts["models"].items():
-            fits = "/".join(map(percent, model["fit"].values())) or "not known"
-            click.echo(
-                f"\nbest {sort} model: {model['kind']}, simulation {fits} % over the rows held out, {model['file']}"
-            )
+            fits = "/".join(map(percent, model["fit"].values()))
+            said = f"simulation {fits} % over the rows held out" if fits else "not judged on rows held out"
+            click.echo(f"\nbest {sort} model: {model['kind']}, {said}, {model['file']}")
         print_table(f"Verdict on {folder}", ["step", "", "processor time [s]"], _rows(facts))
         for metric, one in facts["loosened"].items():
             click.echo(f"all holds but {Loosened(**one).in_words(metric)}")

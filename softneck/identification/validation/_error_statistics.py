@@ -189,9 +189,8 @@ def calibrated_bounds(rows: Rows, errors: Matrix) -> dict[str, Any]:
     motors = [rows.set_points[rows.segment == number] for number in numbers]
     found: dict[str, Any] = {"level_pct": 100.0 * BOUND_LEVEL, "records": len(records), "reason": None}
     if len(records) < LEAST_RECORDS:
-        reason = (
-            f"{len(records)} record(s): bounds at {100 * BOUND_LEVEL:g} % need {LEAST_RECORDS} that are exchangeable"
-        )
+        needed = f"bounds at {100 * BOUND_LEVEL:g} % need {LEAST_RECORDS} separate recordings"
+        reason = f"{needed}; {len(records)} were given"
         return {**found, "reason": reason}
     found["domain"] = dict(zip(("min", "max"), (end.tolist() for end in _range_of(motors)), strict=True))
     inside = [_within(own, [*motors[:number], *motors[number + 1 :]]) for number, own in enumerate(motors)]

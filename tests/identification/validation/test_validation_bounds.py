@@ -63,7 +63,7 @@ def test_fewer_than_nine_records_have_no_bound_and_nine_have_the_largest_error()
     assert found["pointwise"]["pitch"]["half_width"] <= found["path"]["pitch"]["half_width"]
     assert found["path"]["pitch"]["coverage_pct"] is None  # without one of nine there are eight
     few = calibrated_bounds(rows_of(rows.measured[:400], records=8), errors[:400])
-    assert few["reason"] == "8 record(s): bounds at 90 % need 9 that are exchangeable"
+    assert few["reason"] == "bounds at 90 % need 9 separate recordings; 8 were given"
     assert "path" not in few
     assert LEAST_RECORDS == 9
     # Errors as large as the motion bound nothing.
