@@ -3,6 +3,7 @@ from ._robot import Robot as Robot
 
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
+from ._channels import MOST_MOTORS as MOST_MOTORS
 from ._channels import Directions as Directions
 from ._channels import Motors as Motors
 from ._channels import Outputs as Outputs

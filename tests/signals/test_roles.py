@@ -386,3 +386,22 @@ def test_an_input_that_stands_still_is_named(tmp_path: Path) -> None:
     np.savetxt(log, data, delimiter=",", header="time [s],valve [V],angle [deg]", comments="", fmt="%.6f")
     with pytest.raises(DataError, match=r"no column was recognised as motor \(valve \[V\] is constant at 2\.5"):
         guess_robot(log)
+
+
+def test_the_most_motors_and_outputs_are_found_and_one_more_is_refused_by_their_number(tmp_path: Path) -> None:
+    motors = {f"p{j}_cmd_MPa": steps(j, 0.0, 1.0) for j in range(1, 9)}
+    places = ("tip_x", "tip_y", "mid_x", "mid_y")
+    moved = {f"{name}_mm": lagged(motors[f"p{2 * k + 1}_cmd_MPa"], 0.8) for k, name in enumerate(places)}
+
+    def write(columns: dict[str, Vector]) -> Path:
+        log = tmp_path / f"{len(columns)}.csv"
+        data = np.column_stack([TIME, *columns.values()])
+        np.savetxt(log, data, delimiter=",", header=",".join(["t_s", *columns]), comments="", fmt="%.6f")
+        return log
+
+    robot = guess_robot(write({**motors, **moved})).robot
+    assert (len(robot.motors.names), robot.outputs.names) == (8, places)
+    nine = write({**motors, "p9_cmd_MPa": steps(9, 0.0, 1.0), **moved})
+    assert is_of_another_robot(nine)
+    with pytest.raises(DataError, match=r"1 to 8.*Name fewer: --motor COL"):
+        guess_robot(nine)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import DataError, SettingsError, SoftneckError, did_you_mean, to_si
-from softneck.robot import Robot
+from softneck.robot import MOST_MOTORS, Robot
 
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, SET_POINTS, parse_column, si_unit
 from ._column_titles import ambiguity, name_of
@@ -73,6 +73,8 @@ def is_of_another_robot(path: str | Path) -> bool:
         if len(table.columns) < MIN_COLUMNS:
             return True
         roles = find_roles(table, {})
+        if len(roles.motors) > MOST_MOTORS:
+            return True
         # Three motors are a neck's, unless titles name other outputs than angles.
         if motors and not any(names_a_place(table, column) for column in roles.outputs):
             return False

@@ -55,7 +55,8 @@ _WARM = {"temperature", "temp"}
 _PLACE = {"position", "pos", "angle"}
 # Words of which glued titles such as `Pcmd` and `Solldruck` consist, besides one leading letter.
 _KNOWN = _COMMAND | _MEASURED | _SENT | _ACTUATOR | _LOAD | _OUTPUT | _RATE | _ASIDE | _PLACE | {"p"}
-_GLUED = sorted((word for word in _KNOWN | set(_TRANSLATED) if len(word) > 1), key=len, reverse=True)
+# `mid` is no `m` and `id`.
+_GLUED = sorted((word for word in _KNOWN | set(_TRANSLATED) if len(word) > 1 and word != "id"), key=len, reverse=True)
 # A measured motor follows its set-point at least so closely; a copy is equal but for the last digit.
 _FOLLOWS, _DIGITS, _EQUAL = 0.5, 1e-9, 1e-3
 _RATE_AGREES, _FEW_ROWS = 0.98, 20
