@@ -88,3 +88,12 @@ def test_info_of_another_loggers_table_tells_what_it_lacks_as_a_log(call: Call, 
     assert "column `valve` is not a channel of a recording of robot `neck`" in said.error
     assert "use `softneck import` with --guess" in said.error
     assert len(said.error.splitlines()) == 1
+
+
+def test_info_of_a_file_that_takes_long_says_that_it_works(call: Call) -> None:
+    for rows, seconds in ((200, 4), (16_000, 320)):
+        assert call("record", "eq22", "-o", f"{rows}.csv", "--duration", seconds).code == 0
+    assert call("info", "200.csv").err == ""
+    # 1.6 MB: 3 s of processor time where 1 MB took 2 s.
+    said = call("info", "16000.csv")
+    assert (said.code, said.err.splitlines()[:1]) == (0, ["info ..."])
