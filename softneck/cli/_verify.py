@@ -150,7 +150,8 @@ def _tried(folder: Path, families: list[str]) -> list[str]:
 
 def _print(path: Path, found: verification.Verification, folder: Path) -> None:
     table = verification.verdict_table(found)
-    print_table(str(path), table.head, table.rows)
+    below = set(found.evidence.not_computed.values())  # printed once, below, and no cell as wide
+    print_table(str(path), table.head, [[*row[:-1], "" if row[-1] in below else row[-1]] for row in table.rows])
     for part in found.evidence.drawn:
         for row in filter(lambda row: row["motion"] > 0.0, part.draws.coverage):  # files of before have such rows
             click.echo(

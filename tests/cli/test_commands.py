@@ -15,10 +15,12 @@ import pytest
 from softneck.cli import _main
 from softneck.core import CheckFailedError, load, write_certificate
 from softneck.core._certificate import certificate_contents
+from softneck.robot import Robot
 from softneck.signals import read_recording
 
 from ..browser import own_text
 from ..data import LAYOUTS
+from ..design.test_robots import plant
 from .conftest import Call, Said
 
 COMMANDS = tuple(_main._COMMANDS)
@@ -307,3 +309,20 @@ def test_the_arm_is_imported_to_its_first_13000_rows(call: Call, shared_data: Pa
     log = shared_data / "arm_multisine/arm_multisine_400s.csv"
     facts = one_object(call("import", log, "--layout", LAYOUTS / "arm_multisine.toml", "-o", "a.csv", "--json"))
     assert facts["rows"] == 13_000
+
+
+def test_verify_says_once_why_something_was_not_computed(call: Call) -> None:
+    bellows = Robot.from_dict({
+        "name": "bellows", "time_constant_s": 0.2, "sensor": {"noise_std": 0.1},
+        "motors": {"names": ["chamber"], "unit": "bar", "setpoint_min": 0, "setpoint_max": 3, "rate_limit": 20},
+        "outputs": {"names": ["stroke"], "unit": "mm", "min": 0, "max": 60},
+        "directions": {"kind": "matrix", "matrix": [[1.0]]},
+    })  # fmt: skip
+    plant(bellows, gain=2e-7).save("m.npz")
+    assert call("design", "pi", "m.npz", "-o", "pi.npz").code == 0
+    said = call("verify", "pi.npz", "m.npz", "-o", "c.json")
+    assert said.code in (0, 1), said.err
+    assert "not computed: sim: no virtual plant stands for `bellows`" in said.out
+    assert said.out.count("no virtual plant stands for") == 1
+    # As wide as the longest name and value ask: it was 250 columns by a reason in each row.
+    assert max(len(line) for line in said.out.splitlines() if line.startswith("│")) < 200
