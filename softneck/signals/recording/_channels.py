@@ -106,8 +106,8 @@ def parse_column(title: str, robot: Robot = NECK) -> tuple[str, float]:
     name, unit = robot.own(match["name"]), match["unit"].strip()
     if name not in table:
         raise ForeignColumnError(
-            f"column `{name}` is not a channel of a recording of robot {robot.label()}; "
-            f"{did_you_mean(name, table)}{_IMPORT}; or drop the column."
+            f"column `{name}` is not a channel of a recording of robot {robot.label()}, whose outputs are "
+            f"{', '.join(robot.outputs.names)}; {did_you_mean(name, table)}{_IMPORT}; or drop the column."
         )
     factor, unit_si = to_si(unit)
     if unit_si != si_unit(name, robot):
