@@ -23,9 +23,8 @@ _LAST_STEPS = 12
 # The speed of drives shows in their logged motors: it is kept where the squared error of all rows falls to this part,
 # and not tried where not. After `_STEPS` steps it fell to 0.80 or less, or not at all, on 14 recordings of six necks.
 SPEED, _SPEED_SHOWS = "speed", 0.9
-GEOMETRY = "tendons"  # shows in every motion
 # What a part must gain [points]: seeds of the noise move fits by as much. With one motion what was left out resembles
-# the rest: other parts must also gain this share of what is missing to 100 %.
+# the rest: a part must also gain this share of what is missing to 100 %.
 _LEAST_GAIN, _LEAST_SHARE = 0.5, 0.2
 # Parts that were searched at once are dropped again where taking them out costs no more [points].
 _HARDLY = 0.1
@@ -58,7 +57,7 @@ def extend(found: Found, parts: Sequence[str], evaluations: int, tell: SearchPro
 def _able(problem: FitProblem) -> list[str]:
     """Return the parts that a robot can have: no tendons of other robots; in a plane no anisotropy or homing."""
     spatial = problem.has_two_outputs
-    can = {GEOMETRY: problem.has_neck_tendons, "anisotropy": spatial, "homing": spatial}
+    can = {"tendons": problem.has_neck_tendons, "anisotropy": spatial, "homing": spatial}
     return [part for part in PARTS if can.get(part, True)]
 
 
@@ -114,7 +113,7 @@ def choose_parts(
             tried[parts] = _extended(trials, parts, least, steps, tell)
         fits = {parts: fit for parts, (fit, _) in tried.items()}
         more = 0.0 if several else _LEAST_SHARE * (100.0 - least)
-        good = [one for one in fits if fits[one] > least + max(_LEAST_GAIN, 0.0 if one == (GEOMETRY,) else more)]
+        good = [one for one in fits if fits[one] > least + max(_LEAST_GAIN, more)]
         if not good:
             break
         best = max(good, key=lambda parts: fits[parts])
