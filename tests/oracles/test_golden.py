@@ -24,7 +24,8 @@ def test_every_kind_has_a_file_and_what_is_stepped_has_outputs() -> None:
     assert set(OUTPUTS) == stepped | set(NO_FILE)
 
 
-@pytest.mark.parametrize("name", OUTPUTS)
+# What `nmpc` steps takes half a minute to compile.
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "nmpc")) for name in OUTPUTS])
 def test_outputs_are_those_of_the_version_that_wrote_the_file(name: str) -> None:
     expected = np.array(OUTPUTS[name])
     block = block_of(name, GOLDEN)

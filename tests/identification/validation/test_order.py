@@ -549,7 +549,7 @@ def test_without_a_simulation_there_is_none_and_a_row_with_one_output_is_a_row()
     assert np.isnan(found.free_run).all()
     assert found.diverged is None
     whole = validate(rls(), run, horizons=(1, "inf"))
-    assert "1 record(s)" in whole.calibrated_bounds["reason"]
+    assert "1 were given" in whole.calibrated_bounds["reason"]
     assert whole.cold_fits["pitch"] is not None
 
 
