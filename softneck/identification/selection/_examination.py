@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import KINDS, Matrix, Progress, Vector, resolve, to_si
+from softneck.core import KINDS, Matrix, Progress, SoftneckError, Vector, resolve, to_si
 from softneck.plant import has_own_tendons
 from softneck.robot import Robot
 from softneck.signals import Recording
@@ -180,7 +180,7 @@ def fits_to_reference(model: Model, again: Model, fold: Fold) -> tuple[str, Fits
             continue
         try:
             reference = resolve(KINDS[kind].settings)(**settings).fit(fold.train)
-        except Exception:  # a kind for other robots, or for more rows
+        except (SoftneckError, np.linalg.LinAlgError):  # a kind for other robots, or for more rows
             continue
         known = _least_fit(reference, fold)
         if known >= POOR_FIT_PCT and 2.0 * (100.0 - known) ** 2 <= (100.0 - own) ** 2:
