@@ -30,7 +30,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.baseline import MODELS, Job, compute, recorded, records_of_tests, training
 from softneck.identification import INFINITE, Model, SetMembership, choose, identify, validate
-from softneck.identification.selection._examination import MISSING, tests_by
+from softneck.identification.selection._examination import MISSING, part_of_reference
 from softneck.signals import signal
 from tests.foreign_necks.kept import keep, kept_lines
 from tests.foreign_necks.necks import CHOOSING
@@ -151,7 +151,7 @@ def print_each(necks: list[str], kinds: list[str], seed: int, *, fresh: bool) ->
 
 
 def _simulated(said: dict[str, Any]) -> bool:
-    return any(part.startswith(tests_by("")) for part in said["parts"])
+    return any(part.startswith(part_of_reference("")) for part in said["parts"])
 
 
 def _number(said: float | None) -> float:

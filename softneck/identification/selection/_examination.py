@@ -80,7 +80,8 @@ class Examination:
     def expected(self, kind: str) -> float:
         """Return the fit to be expected on other motions [%]; NaN where nothing could be left out of a training."""
         if self.reference:
-            return min(self.parts[tests_by(self.reference)].values())
+            fits = self.parts[part_of_reference(self.reference)].values()
+            return min((fit for fit in fits if fit == fit), default=float("nan"))
         if kind in AGAIN and set(self.parts) == {HOLD_OUT}:
             return float("nan")
         return 100.0 - MISSING.get(kind, (1.0, 1.0))[self.other_motion] * (100.0 - self.worst[2])
@@ -107,7 +108,7 @@ def _number(fit: float) -> float | None:
     return float(fit) if np.isfinite(fit) else None
 
 
-def tests_by(kind: str) -> str:
+def part_of_reference(kind: str) -> str:
     """Return the name of the part that has the paper's tests, simulated by a kind."""
     return f"steps, sine and rotation of {kind}"
 
@@ -146,7 +147,7 @@ def examine(
             model = calibrate_validity(model, again, recording, rows)
             bounds = coverage(again, recording, rows)
             reference, fits = ("", {}) if several else fits_to_reference(model, again, fold)
-            parts |= {tests_by(reference): fits} if reference else {}
+            parts |= {part_of_reference(reference): fits} if reference else {}
     return Examination(parts, several, bounds, reference), model
 
 
@@ -171,8 +172,8 @@ def fits_to_reference(model: Model, again: Model, fold: Fold) -> tuple[str, Fits
     """Return the kind that stands for the robot on the paper's tests, and the fits to be expected there [%].
 
     It is the first that has understood the recording and whose squared error on what the fold leaves out is at most
-    half that of `again`, the short form of `model`; "" if there is none. How far a model is from it and how far it is
-    itself from the robot are independent errors, whose squares add.
+    half that of `again`, the short form of `model`; "" if there is none. The error of a model against it and its own
+    against the robot are taken as independent: their squares add.
     """
     own = _least_fit(again, fold)
     for kind, settings in REFERENCES.items():
@@ -192,14 +193,16 @@ def fits_to_reference(model: Model, again: Model, fold: Fold) -> tuple[str, Fits
 
 
 def _lowest_fits(runs: Sequence[Matrix], others: Sequence[Matrix]) -> Vector:
-    """Return (outputs,) the lowest fit [%] of `others` to `runs`, (time, outputs) each; -inf where one diverged."""
+    """Return (outputs,) the lowest fit [%] of `others` to `runs`, (time, outputs) each.
+
+    -inf where one diverged, NaN where an output is at rest in all of them.
+    """
     with np.errstate(over="ignore"):  # what grows without bound is no number sooner or later
         finite = all(np.isfinite(np.square(free).sum()) for free in (*runs, *others))
     if not finite:
         return np.full(runs[0].shape[1], -np.inf)
     fits = [[nrmse_fit(*pair) for pair in zip(y.T, z.T, strict=True)] for y, z in zip(runs, others, strict=True)]
-    # At rest an output has no fit.
-    return np.min(np.nan_to_num(fits, nan=100.0), axis=0)
+    return np.fmin.reduce(np.array(fits, dtype=float), axis=0)
 
 
 def _least_fit(model: Model, fold: Fold) -> float:

@@ -20,10 +20,13 @@ from softneck.identification.models._left_out import Fold, Judged, folds, motion
 from softneck.identification.models._scores import nrmse_fit
 from softneck.identification.models._validity import calibrate_validity, tolerance_of
 from softneck.identification.selection._examination import (
+    HOLD_OUT,
     Examination,
+    _lowest_fits,
     examine,
     fits_to_reference,
     other_motion,
+    part_of_reference,
     second_training,
     shortened,
     unseen_rows,
@@ -499,3 +502,16 @@ def test_runs_whose_spread_differs_by_a_quarter_are_other_motions(factors: tuple
     still = np.zeros((200, 3))
     assert not other_motion(of_runs([100, 100], still))
     assert not other_motion(of_runs([1], still[:1]))
+
+
+def test_an_output_at_rest_promises_nothing_and_the_others_decide() -> None:
+    """Of two motions the one that moves an output decides; an output that none moves has no fit, not a perfect one."""
+    wave, rest = np.sin(2.0 * np.pi * np.arange(50.0) / 50.0), np.zeros(50)  # its mean is zero, so a tenth more is 90 %
+    runs = [np.column_stack([wave, rest, rest]), np.column_stack([wave, rest, wave])]
+    fits = _lowest_fits(runs, [1.1 * run for run in runs])
+    assert fits[0] == pytest.approx(90.0)
+    assert math.isnan(fits[1])
+    assert fits[2] == pytest.approx(90.0)
+    parts = {HOLD_OUT: {"x": 99.0}, part_of_reference("oe"): dict(zip("zyx", fits[[1, 0, 2]].tolist(), strict=True))}
+    assert Examination(parts, False, reference="oe").expected("rls") == pytest.approx(90.0)
+    assert math.isnan(Examination({part_of_reference("oe"): {"y": math.nan}}, False, reference="oe").expected("rls"))
