@@ -57,7 +57,7 @@ class PlayStructure:
 
     @property
     def chains(self) -> np.ndarray:
-        """(inputs, chains, n) which terms are those of each chain of an input, the one without a play first."""
+        """Masks (inputs, chains, n) of the linear terms of each chain; that without a play is first."""
         chains = self.inputs * (1 + len(self.widths))
         places = np.arange(len(self.table)) - 1
         of = np.where((places >= 0) & (places < chains * self.order), places // self.order, -1)
@@ -158,10 +158,11 @@ def spread_of(X: Matrix, weight: float) -> Matrix:
 
 
 def rising(W: Matrix, spread: Matrix, chains: np.ndarray) -> Matrix:
-    """Return the weights (outputs, n) nearest to W, by their `spread` (n, n), with no chain of negative share.
+    """Return the weights (outputs, n) nearest to W with no chain of negative share; `spread` (n, n): their covariance.
 
-    A hysteresis of plays with positive shares dissipates; with negative ones small motions would go the wrong way, and
-    a loop with an integrator oscillate (Kuhnen 2003, Eur. J. Control 9:407). `chains`: as for `ridge`.
+    The share of a chain is its static gain over that of all chains of its input. Plays of positive shares dissipate;
+    with a negative one small motions would go the wrong way, and a loop with an integrator oscillate (Kuhnen 2003,
+    Eur. J. Control 9:407). `chains`: as for `ridge`.
     """
     found = W.copy()
     for output, w in enumerate(W):

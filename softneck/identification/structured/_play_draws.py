@@ -28,7 +28,7 @@ class PlayDraws:
         terms, outputs: (rows, terms) and (rows, outputs) from which the weights are learned.
         groups: (rows,) the segment of each row.
         weight: of the ridge.
-        chains: (inputs, chains, terms) which terms are those of each chain.
+        chains: masks (inputs, chains, terms) of the linear terms of each chain.
         middle, spread: (outputs, terms) weights of all rows, and (terms, terms) their covariance up to a factor.
     """
 
