@@ -53,11 +53,10 @@ if TYPE_CHECKING:
     help="Add outputs of later samples (pitch_next, pitch_ahead, motor_setpoint_1_next, ..) and their directional "
     "derivatives; with --backend compiled.",
 )
-@click.option("--name", metavar="NAME", help="Model name of the FMU.  [default: the stem of its file name]")
 @common_options("robot", "force")
 def command(
     files: tuple[str, ...], output: Path | None, data: tuple[Path, ...],
-    backend: str | None, fmi: str, platforms: tuple[str, ...], sensitivities: bool, name: str | None,
+    backend: str | None, fmi: str, platforms: tuple[str, ...], sensitivities: bool,
     robot: str | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Package FILE as an FMU of FMI 2.0 or 3.0; of several files, or of a folder, -o is a folder.
@@ -74,7 +73,7 @@ def command(
 
     many = len(files) != 1 or Path(files[0]).is_dir()
     if output is not None and output.suffix.lower() == ".ssp":
-        if many or data or fmi != "2" or platforms or sensitivities or name:
+        if many or data or fmi != "2" or platforms or sensitivities:
             raise SettingsError(f"{output}: an SSP file is made of one loop file, and takes --backend only.")
         _ssp(Path(files[0]), output, robot, compiled=backend != "python", force=force, as_json=as_json)
         return
@@ -82,12 +81,10 @@ def command(
         raise SettingsError(
             "--fmi 3, --platform and --sensitivities are for compiled FMUs only; add `--backend compiled`."
         )
-    if name is not None and many:
-        raise SettingsError("--name is for one FMU; those of several files are named by them.")
     origin = ""
     jobs, replace = _what(files, output, force=force)
     # All are read before any is written: one bad file stops the command with nothing done.
-    things = [(source, open_buildable(source, robot), path) for source, path in jobs if not many or _can_be_fmu(source)]
+    things = [(source, open_buildable(source, robot), path) for source, path in jobs if not many or _has_block(source)]
     built, left_out = [], [str(source) for source, _ in jobs if source not in {source for source, _, _ in things}]
     with progress("build FMU", quiet=as_json) as report:
         for number, (source, thing, path) in enumerate(things):
@@ -97,17 +94,10 @@ def command(
             if backend == "compiled":
                 ahead = sensitivities and (not many or _has_sensitivities(block))
                 origin = build_compiled_fmu(
-                    block,
-                    path,
-                    info=info,
-                    force=replace,
-                    fmi=int(fmi),
-                    platforms=platforms,
-                    sensitivities=ahead,
-                    name=name,
+                    block, path, info=info, force=replace, fmi=int(fmi), platforms=platforms, sensitivities=ahead
                 )
             else:
-                build_fmu(block, path, info=info, force=replace, name=name)
+                build_fmu(block, path, info=info, force=replace)
             built.append({"source": str(source), "fmu": str(path)})
     if as_json:
         print_json({"fmus": built, "left_out": left_out} | ({"libraries": origin} if origin else {}))
@@ -149,7 +139,7 @@ def open_buildable(source: str | Path, robot: str | None = None) -> Buildable:
     )
 
 
-def _can_be_fmu(source: str | Path) -> bool:
+def _has_block(source: str | Path) -> bool:
     return Path(source).suffix != ".npz" or hasattr(load(source), "block")
 
 

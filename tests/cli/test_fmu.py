@@ -114,16 +114,10 @@ def test_what_cannot_become_an_fmu_is_said(call: Call, rls_file: Path, tmp_path:
     assert not list(tmp_path.glob("*.fmu"))
 
 
-def test_a_model_may_have_another_name_than_its_file(call: Call, rls_file: Path) -> None:
-    assert call("fmu", rls_file, "-o", "rls.c2.fmu", "--name", "Rls").code == 0
-    assert fmpy.read_model_description("rls.c2.fmu").modelName == "Rls"
-    told = json.loads(call("info", "rls.c2.fmu", "--json").out)
-    assert (told["model"], told["interfaces"]) == ("Rls", "Co-Simulation")
+def test_the_name_of_the_file_is_that_of_the_model(call: Call, rls_file: Path) -> None:
     for name, text in (("a-b", "`a-b` cannot be the model name"), ("class", "`class` cannot be")):
-        said = call("fmu", rls_file, "-o", "rls.c3.fmu", "--name", name)
+        said = call("fmu", rls_file, "-o", f"{name}.fmu")
         assert (said.code, text in said.error) == (2, True)
-    said = call("fmu", rls_file, rls_file, "-o", "many", "--name", "Rls")
-    assert (said.code, "--name is for one FMU" in said.error) == (2, True)
 
 
 def test_a_model_of_another_version_is_refused(call: Call, rls_file: Path) -> None:

@@ -49,7 +49,7 @@ and put it into binaries/ under the folder of your platform. `sn_kinds.h` was ge
 
 def build_compiled_fmu(
     thing: Buildable | Block | str | Path, path: str | Path, *, info: FmuInfo | None = None, force: bool = False,
-    fmi: int = 2, platforms: Sequence[str] = (), sensitivities: bool = False, name: str | None = None,
+    fmi: int = 2, platforms: Sequence[str] = (), sensitivities: bool = False,
 ) -> str:  # fmt: skip
     """Write `thing` as an FMU that needs no Python; return one line on the origin of its libraries.
 
@@ -65,7 +65,6 @@ def build_compiled_fmu(
         platforms: on which the FMU must run, e.g. "x86_64-windows"; none: all with a library on this machine.
         sensitivities: add outputs of the next sample (`pitch_next`, ..), of a plant also those of a later one
             (`pitch_ahead`, ..), and their directional derivatives.
-        name: the model name, if the file shall have another.
 
     Raises:
         SettingsError: NAME is not an FMI identifier, the kind cannot be compiled or has no derivative, or a platform
@@ -74,7 +73,7 @@ def build_compiled_fmu(
         OutputFileError: the file exists or cannot be written.
     """
     target = as_path(path)
-    name = model_name(target, name)
+    name = model_name(target)
     refuse_existing(target, force=force)
     block, said = block_and_info(thing, info)
     check_block(block)

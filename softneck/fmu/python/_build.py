@@ -42,9 +42,8 @@ _KNOWN_ROLES = ("plant", "observer", "controller", "reference")
 
 
 def build_fmu(
-    thing: Buildable | Block | str | Path, path: str | Path, *, info: FmuInfo | None = None, force: bool = False,
-    name: str | None = None,
-) -> Path:  # fmt: skip
+    thing: Buildable | Block | str | Path, path: str | Path, *, info: FmuInfo | None = None, force: bool = False
+) -> Path:
     """Write a model, observer, controller or neck as an FMI 2.0 Co-Simulation FMU and return its path.
 
     The FMU contains the runtime of the block's kind, its arrays and pythonfmu's binaries; it needs Python
@@ -55,7 +54,6 @@ def build_fmu(
         path: `NAME.fmu`; NAME becomes the model name.
         info: texts of the FMU; those of `fmu_info` if not given.
         force: replace an existing file.
-        name: the model name, if the file shall have another.
 
     Raises:
         SettingsError: NAME is not an FMI identifier, or the block cannot be packaged.
@@ -72,7 +70,7 @@ def build_fmu(
         'Neck.fmu'
     """
     target = as_path(path)
-    name = model_name(target, name)
+    name = model_name(target)
     refuse_existing(target, force=force)
     block, said = block_and_info(thing, info)
     check_block(block)
@@ -82,17 +80,16 @@ def build_fmu(
     return target
 
 
-def model_name(path: Path, name: str | None = None) -> str:
-    """Return the model name of an FMU file: `name`, or the stem of its file name."""
+def model_name(path: Path) -> str:
+    """Return the model name of an FMU file: the stem of its file name."""
     if path.suffix != ".fmu":
         raise SettingsError(f"{path}: an FMU's file name must end in `.fmu`.")
-    chosen = path.stem if name is None else name
-    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", chosen) or keyword.iskeyword(chosen):
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", path.stem) or keyword.iskeyword(path.stem):
         raise SettingsError(
-            f"`{chosen}` cannot be the model name of an FMU; use letters, digits and _ only, "
-            f"no digit in front and no Python keyword{', or give a name (--name)' if name is None else ''}."
+            f"{path}: `{path.stem}` cannot be the model name of an FMU; name the file with letters, digits and _ only, "
+            "no digit in front and no Python keyword."
         )
-    return chosen
+    return path.stem
 
 
 def check_block(block: Block) -> None:

@@ -15,6 +15,7 @@ from softneck.core import SettingsError
 from softneck.runtime import COMPILE_OPTIONS, _numba_cache, bundle, compiled_name, content_name
 
 from ..describe._describe import MINIMUM_PYTHON
+from ._slave_compiled import _FMU_BORDER
 
 # Written to the FMU and checked first; its syntax must be valid for old versions of Python.
 _CHECK = f'''"""A softneck FMU: generated, do not edit."""
@@ -74,8 +75,7 @@ def slave_module(runtime: str) -> SlaveModule:
     clash = _names(text) & set[str]().union(*map(_names, parts))
     if clash:
         raise SettingsError(f"runtime module {runtime} defines {', '.join(sorted(clash))}; the FMU's slave does too.")
-    border = _constant(parts[1], "_FMU_BORDER")
-    source = border + text + border + "\n".join(map(_without_own_imports, parts))
+    source = _FMU_BORDER + text + _FMU_BORDER + "\n".join(map(_without_own_imports, parts))
     name = content_name(source)
     script = f"{_CHECK}{_SCRIPT_TEMPLATE.format(name=name)}"
     return SlaveModule(name, source, content_name(script, "softneck_fmu"), script, compiled_name(text), COMPILE_OPTIONS)
@@ -100,10 +100,3 @@ def _names(source: str) -> set[str]:
         for target in node.targets if isinstance(node, ast.Assign) else []:
             names.update({target.id} if isinstance(target, ast.Name) else set())
     return names
-
-
-def _constant(source: str, name: str) -> str:
-    for node in ast.parse(source).body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name:
-            return str(ast.literal_eval(node.value))
-    raise SettingsError(f"the slave does not define {name}.")
