@@ -299,7 +299,8 @@ def _check_names(found: dict[str, list[_Piece]]) -> None:
 def _reachable_names(found: dict[str, list[_Piece]], outer: str, others: set[str]) -> set[str]:
     """Return the names that the outer module defines or imports, and all that these, the loops and `others` use."""
     reads = {name: piece.reads for pieces in found.values() for piece in pieces for name in piece.names}
-    waiting = ["state_size", *others, *(item for node in _tree(outer).body for item in _imported_names(node))]
+    imported = [item for node in _tree(outer).body if isinstance(node, ast.ImportFrom) for item in node.names]
+    waiting = ["state_size", *others, *(item.asname or item.name for item in imported)]
     waiting += [name for module in (outer, _LOOPS_MODULE) for piece in found.get(module, ()) for name in piece.names]
     kept: set[str] = set()
     while waiting:
@@ -308,10 +309,6 @@ def _reachable_names(found: dict[str, list[_Piece]], outer: str, others: set[str
             kept.add(name)
             waiting += reads[name]
     return kept
-
-
-def _imported_names(node: ast.stmt) -> list[str]:
-    return [item.asname or item.name for item in node.names] if isinstance(node, ast.ImportFrom) else []
 
 
 def _check_import(module: str, node: ast.Import | ast.ImportFrom) -> None:

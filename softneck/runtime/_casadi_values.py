@@ -55,8 +55,6 @@ class Values:
 
     def operate(self, op: ast.AST, left: Any, right: Any) -> Any:
         """Return `left op right`, entry by entry."""
-        if isinstance(op, ast.MatMult):
-            return self.dot(left, right)
         function = _OPERATORS.get(type(op))
         if function is None or (isinstance(op, _KNOWN_ONLY) and (self.symbolic(left) or self.symbolic(right))):
             raise TypeError(f"the operator {type(op).__name__} is not one for symbols")

@@ -99,9 +99,6 @@ class Walk:
             except _WRONG as error:
                 self._fail(node, error)
 
-    def _pass(self, _: ast.Pass) -> None:
-        pass
-
     def _expr(self, node: ast.Expr) -> None:
         self._value(node.value)
 
@@ -109,10 +106,6 @@ class Walk:
         value = self._value(node.value)
         for target in node.targets:
             self._store(target, value)
-
-    def _annassign(self, node: ast.AnnAssign) -> None:
-        if node.value is not None:
-            self._store(node.target, self._value(node.value))
 
     def _augassign(self, node: ast.AugAssign) -> None:
         before = self._value(node.target)
@@ -354,21 +347,15 @@ class Walk:
         return _BUILTINS[name](*(self._number(item, value) for item, value in zip(node.args, values, strict=True)))
 
     def _library(self, node: ast.Call, name: str, values: list[Any]) -> Any:
-        if name in ("empty", "zeros", "ones"):
+        if name in ("empty", "zeros"):
             # Reading an entry that was never written is an error, as None has no arithmetic.
-            return np.full(values[0], {"empty": None, "zeros": 0.0, "ones": 1.0}[name], dtype=object)
-        if name in ("empty_like", "zeros_like"):
-            return np.full(values[0].shape, None if name == "empty_like" else 0.0, dtype=object)
+            return np.full(values[0], None if name == "empty" else 0.0, dtype=object)
         if name in ("min", "max"):
             return self._v.extreme(f"f{name}", list(values[0].flat))
-        if name == "sum":
-            return sum(values[0].flat)
         if name in ("dot", "sort"):
             return getattr(self._v, name)(*values)
-        if name == "clip":
-            return self._v.call("fmin", self._v.call("fmax", values[0], values[1]), values[2])
-        if name in ("isfinite", "isnan"):
-            return bool(getattr(np, name)(self._number(node.args[0], values[0])))
+        if name == "isfinite":
+            return bool(np.isfinite(self._number(node.args[0], values[0])))
         return self._v.call(name, *values)
 
 
@@ -377,7 +364,7 @@ def _root(array: np.ndarray) -> np.ndarray:
     return array if array.base is None else _root(array.base)
 
 
-_BUILTINS = {"int": int, "float": float, "bool": bool, "len": len, "range": range, "round": round}
+_BUILTINS = {"int": int, "float": float, "bool": bool, "range": range}
 
 
 def step_function(block: Block, parameters: Vector, inputs: int) -> Any:

@@ -17,8 +17,8 @@ from softneck.core import SettingsError
 RANDOM = re.compile(r"(m\d+_)*random_\w+")
 _MEMBERS_NAME = re.compile(r"^(m\d+_)+")
 # Functions that create arrays; functions that are piecewise constant and have no derivative.
-MAKERS = ("empty", "zeros", "ones", "empty_like", "zeros_like")
-STEPS = ("int", "bool", "len", "floor", "ceil", "round", "isfinite", "isnan", "isinf")
+MAKERS = ("empty", "zeros")
+STEPS = ("int", "bool", "floor", "ceil", "isfinite")
 # A search among data `low, high = f(..., w)` is differentiated by the text's own `f_slopes(..., w, low, high, slopes)`.
 SLOPES = "_slopes"
 

@@ -63,7 +63,7 @@ class Back(Lowering):
             outside, self.lines = self.lines, []
             handler: Callable[[ast.stmt], list[str]] | None = {
                 ast.Assign: self._assign, ast.AugAssign: self._assign, ast.If: self._if, ast.For: self._for,
-                ast.Return: self._return, ast.Expr: self._nothing, ast.Pass: self._nothing,
+                ast.Return: self._return,
             }.get(type(node))  # type: ignore[assignment]  # fmt: skip
             if handler is None:
                 raise self.fail(node, "this statement is not reversed.")
@@ -71,11 +71,6 @@ class Back(Lowering):
             forward, back = forward + self.lines, reverse + back
             self.lines = outside
         return forward, back
-
-    def _nothing(self, node: ast.stmt) -> list[str]:
-        if isinstance(node, ast.Expr) and not isinstance(node.value, ast.Constant):
-            raise self.fail(node, "a call without a result is not reversed.")
-        return []
 
     def _assign(self, node: ast.stmt) -> list[str]:
         act = self.activity
@@ -236,15 +231,12 @@ class Back(Lowering):
 
     def _split_pair(self, node: ast.BinOp) -> tuple[str, Callable[[str], list[str]]]:
         (a, first), (b, second) = self._split_vector(node.left), self._split_vector(node.right)
-        both = self.activity.is_active(node.left) and self.activity.is_active(node.right)
         if isinstance(node.op, ast.Add | ast.Sub):
             sign = "+" if isinstance(node.op, ast.Add) else "-"
             return f"({a} {sign} {b})", lambda bar: first(bar) + second(bar if sign == "+" else f"(-{bar})")
-        if both or (isinstance(node.op, ast.Div) and self.activity.is_active(node.right)):
+        if not isinstance(node.op, ast.Div) or self.activity.is_active(node.right):
             raise self.fail(node, "this array is not reversed.")
-        if isinstance(node.op, ast.Div):
-            return f"({a} / {b})", lambda bar: first(f"({bar} / {b})")
-        return f"({a} * {b})", lambda bar: first(f"({bar} * {b})") + second(f"({bar} * {a})")
+        return f"({a} / {b})", lambda bar: first(f"({bar} / {b})")
 
 
 def _unroll(body: list[ast.stmt]) -> list[ast.stmt]:

@@ -111,8 +111,6 @@ class Rows(Vectors):
         self.lines = outside
 
     def _expression(self, node: ast.Expr) -> None:
-        if isinstance(node.value, ast.Constant):
-            return
         name = self.activity.program.callee_name(node.value)
         if name is not None and isinstance(node.value, ast.Call) and self.activity.pattern(node.value, name):
             self._whole = node.value
@@ -178,8 +176,7 @@ class Rows(Vectors):
         if len(one) > 1:
             read = {name.id for _, value in one if value is not None for name in names(value)}
             if read & {ast.unparse(target) for target, _ in one}:
-                self._several(node, one)
-                return
+                raise self.fail(node, "the derivative of numbers that are exchanged is not known.")
             for target, value in one:  # no target is read later: assigning one by one is the same
                 if value is not None:
                     self._assign(ast.Assign([target], value, lineno=0))
@@ -192,19 +189,6 @@ class Rows(Vectors):
             self._number(target, *self.value(value))
         else:
             self._array(node, target, value)
-
-    def _several(self, node: ast.stmt, one: list[tuple[ast.expr, ast.expr | None]]) -> None:
-        """Assign several numbers at once: all values before any target."""
-        values = []
-        for target, value in one:
-            if value is None or self.activity.rank(target) != 0:
-                raise self.fail(node, "the derivative of this assignment is not known.")
-            text, terms = self.value(value)
-            moved = self.name("d")
-            self._waiting.append(f"«{moved}» = {linear(terms)}")
-            values.append((target, self.bind(text), [("1.0", f"«{moved}»")]))
-        for target, text, terms in values:
-            self._number(target, text, terms)
 
     def _numbers(self, node: ast.stmt, targets: list[ast.expr], call: ast.Call) -> None:
         """Assign the numbers of a call with several results."""

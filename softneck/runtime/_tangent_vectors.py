@@ -18,10 +18,8 @@ _KEPT = re.compile(r"_[a-z]\d+|-?\d+(\.\d*)?(e-?\d+)?")
 _SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 # Derivatives of f(x), with v for f(x). That of a root of zero is set to 0: it has no finite slope.
 _SLOPES = {
-    "sin": "math.cos({x})", "cos": "-math.sin({x})", "tan": "1.0 + {v} * {v}", "tanh": "1.0 - {v} * {v}",
-    "exp": "{v}", "log": "1.0 / {x}", "sqrt": "0.5 / {v} if {v} > 0.0 else 0.0", "atan": "1.0 / (1.0 + {x} * {x})",
-    "arctan": "1.0 / (1.0 + {x} * {x})", "asin": "1.0 / math.sqrt(1.0 - {x} * {x})",
-    "acos": "-1.0 / math.sqrt(1.0 - {x} * {x})",
+    "sin": "math.cos({x})", "cos": "-math.sin({x})", "tanh": "1.0 - {v} * {v}", "exp": "{v}", "log": "1.0 / {x}",
+    "sqrt": "0.5 / {v} if {v} > 0.0 else 0.0",
 }  # fmt: skip
 # A length below 1e-12 is rounding and has no direction; this is its square.
 _NO_LENGTH = 1e-24
@@ -110,8 +108,6 @@ class Lowering:
 
     def _unaryop(self, node: ast.UnaryOp) -> tuple[str, Terms]:
         text, terms = self.value(node.operand)
-        if isinstance(node.op, ast.UAdd):
-            return text, terms
         if not isinstance(node.op, ast.USub):
             raise self.fail(node, "this operator has no derivative.")
         return f"(-{text})", self.times(terms, "-1.0")
@@ -120,8 +116,6 @@ class Lowering:
         if isinstance(node.op, ast.Pow):
             return self._power(node)
         (a, first), (b, second) = self.value(node.left), self.value(node.right)
-        if isinstance(node.op, ast.Mod) and not second:
-            return f"({a} % {b})", first
         sign = _SIGNS.get(type(node.op))
         if sign is None:
             raise self.fail(node, "this operator has no derivative.")
@@ -174,11 +168,11 @@ class Lowering:
             raise self.fail(node, "keyword arguments are not differentiated.")
         if name == "dot":
             return self.product(node)
-        if name in ("max", "min", "maximum", "minimum") and len(node.args) > 1:
-            return self._extreme(node, 1 if name.startswith("max") else -1)
-        if name in ("atan2", "arctan2", "hypot") and len(node.args) == 2:
-            return self._pair(node, name)
-        if len(node.args) != 1 or name not in (*_SLOPES, "float", "abs", "fabs"):
+        if name in ("max", "min") and len(node.args) > 1:
+            return self._extreme(node, 1 if name == "max" else -1)
+        if name == "atan2":
+            return self._atan2(node)
+        if len(node.args) != 1 or name not in (*_SLOPES, "float", "abs"):
             raise self.fail(node, "the derivative of this function is not known.")
         if name == "sqrt" and (parts := squares(node.args[0])):
             return self._root(node, parts)
@@ -186,7 +180,7 @@ class Lowering:
         if name == "float":
             return f"float({text})", terms
         text = self.bind(text)
-        if name in ("abs", "fabs"):
+        if name == "abs":
             return f"abs({text})", self._select(1, (text, terms), (f"-{text}", self.times(terms, "-1.0")))
         value = self.bind(f"{ast.unparse(function)}({text})")
         return value, self.times(terms, _SLOPES[name].format(x=text, v=value))
@@ -201,12 +195,10 @@ class Lowering:
             value = f"{function}({value}, {text})"
         return value, terms
 
-    def _pair(self, node: ast.Call, name: str) -> tuple[str, Terms]:
+    def _atan2(self, node: ast.Call) -> tuple[str, Terms]:
         parts = [self.value(part) for part in node.args]
         (a, first), (b, second) = ((self.bind(text), terms) for text, terms in parts)
         value = self.bind(f"{ast.unparse(node.func)}({a}, {b})")
-        if name == "hypot":
-            return value, self._length(value, [(a, first), (b, second)])
         square = self.bind(f"{a} * {a} + {b} * {b}")
         return value, self.sum(self.times(first, f"{b} / {square}"), self.times(second, f"-{a} / {square}"))
 
@@ -375,8 +367,6 @@ class Vectors(Lowering):
         act = self.activity
         if not act.is_active(value):
             return []
-        if is_copy(value):
-            return self._vector(node, value.func.value)  # type: ignore[union-attr]
         if isinstance(value, ast.Name | ast.Subscript):
             rows, start, _ = self._part_of_rows(value)
             return [("1.0", f"{rows}[{self.bind(start, 'i')} + _i, _r]")]
@@ -388,13 +378,6 @@ class Vectors(Lowering):
             return self.sum(self._vector(node, value.left), right)
         if isinstance(value, ast.BinOp) and isinstance(value.op, ast.Mult | ast.Div):
             left, right = value.left, value.right
-            if act.is_active(right) and isinstance(value.op, ast.Mult):
-                left, right = right, left
-            if act.rank(right) == 0 and not act.is_active(right):
-                factor = self.bind(ast.unparse(right))
-                return self.times(
-                    self._vector(node, left), factor if isinstance(value.op, ast.Mult) else f"1.0 / {factor}"
-                )
             if act.rank(right) != 0 and not act.is_active(right) and isinstance(right, ast.Name | ast.Subscript):
                 sign = "*" if isinstance(value.op, ast.Mult) else "/"  # entry by entry
                 return [(one, f"{place} {sign} {ast.unparse(right)}[_i]") for one, place in self._vector(node, left)]
@@ -450,6 +433,4 @@ def made_rows(node: ast.Call) -> str:
     name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
     shape = node.args[0]
     sizes = list(map(ast.unparse, shape.elts)) if isinstance(shape, ast.Tuple) else [ast.unparse(shape)]
-    if name.endswith("_like"):
-        sizes = [f"{sizes[0]}.shape[0]"]
-    return f"np.{'empty' if name.startswith('empty') else 'zeros'}(({', '.join([*sizes, 'moved'])}))"
+    return f"np.{name}(({', '.join([*sizes, 'moved'])}))"

@@ -48,7 +48,7 @@ BRANCH = """
     LIMIT = 0.5
 
     def f(a, b):
-        x = np.ones(3)
+        x = np.zeros(3)
         part = x[1:]
         y = 2.0
         if a > LIMIT:

@@ -223,12 +223,6 @@ SN_APART static SN_INSIDE sn_v1 sn_row2(sn_work *w, const sn_v2 *m, int64_t i)
     return v;
 }
 
-SN_APART static SN_INSIDE sn_v1 sn_column2(sn_work *w, const sn_v2 *m, int64_t j)
-{
-    sn_v2 t = {m->p, m->n1, m->n0, m->s1, m->s0};
-    return sn_row2(w, &t, j);
-}
-
 SN_APART static SN_INSIDE sn_v2 sn_row3(sn_work *w, const sn_v3 *c, int64_t i)
 {
     sn_v2 m = {c->p, c->n1, c->n2, c->s1, c->s2};
@@ -330,7 +324,6 @@ SN_APART static int64_t sn_modulo(sn_work *w, int64_t a, int64_t b)
 
 static inline int64_t sn_min_i(int64_t a, int64_t b) { return b < a ? b : a; }
 static inline int64_t sn_max_i(int64_t a, int64_t b) { return b > a ? b : a; }
-static inline int64_t sn_abs_i(int64_t a) { return a < 0 ? -a : a; }
 static inline double sn_min(double a, double b) { return b < a ? b : a; }
 static inline double sn_max(double a, double b) { return b > a ? b : a; }
 

@@ -174,16 +174,6 @@ static double sn_cos(double x)
     return n == 1 || n == 2 ? -y : y;
 }
 
-static double sn_tan(double x)
-{
-    double r, t;
-    int n;
-    if (!sn_finite(x))
-        return x - x;
-    n = sn_quarters(x, &r, &t);
-    return n & 1 ? -sn_cos_small(r, t) / sn_sin_small(r, t) : sn_sin_small(r, t) / sn_cos_small(r, t);
-}
-
 /* tanh(|x|) = e / (e + 2) with e = exp(2 |x|) - 1; no branch, so that compilers take several at once. */
 static inline double sn_tanh(double x)
 {
@@ -239,22 +229,6 @@ static double sn_atan2(double y, double x)
     if (sn_to_bits(x) >> 63)
         r = SN_PI - (r - 1.2246467991473532e-16);
     return sn_to_bits(y) >> 63 ? -r : r;
-}
-
-static double sn_atan(double x) { return sn_atan2(x, 1.0); }
-static double sn_asin(double x) { return sn_atan2(x, sqrt((1.0 - x) * (1.0 + x))); }
-static double sn_acos(double x) { return sn_atan2(sqrt((1.0 - x) * (1.0 + x)), x); }
-
-static double sn_hypot(double x, double y)
-{
-    double a = fabs(x), b = fabs(y), big = a > b ? a : b, small = a > b ? b : a;
-    if (big > DBL_MAX || small != small || big != big)
-        return big > DBL_MAX || small > DBL_MAX ? HUGE_VAL : x + y;
-    if (big > 1e150 || (big < 1e-140 && big > 0.0)) {
-        small /= big;
-        return big * sqrt(1.0 + small * small);
-    }
-    return sqrt(big * big + small * small);
 }
 
 /* a % b of Python: the sign of b. */

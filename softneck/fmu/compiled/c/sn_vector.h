@@ -95,8 +95,6 @@ SN_PAIRS(sn_add, SN_ADD)
 SN_PAIRS(sn_sub, SN_SUB)
 SN_PAIRS(sn_mul, SN_MUL)
 SN_PAIRS(sn_div, SN_DIV)
-SN_PAIRS(sn_minimum, sn_min)
-SN_PAIRS(sn_maximum, sn_max)
 
 #define SN_EACH(name, OP)                                                                                           \
     static SN_INSIDE sn_v1 name##_v(sn_work *w, sn_v1 a)                                                            \
@@ -110,10 +108,6 @@ SN_PAIRS(sn_maximum, sn_max)
 SN_EACH(sn_negative, -)
 SN_EACH(sn_absolute, fabs)
 SN_EACH(sn_sqrt, sqrt)
-SN_EACH(sn_exp, sn_exp)
-SN_EACH(sn_log, sn_log)
-SN_EACH(sn_sin, sn_sin)
-SN_EACH(sn_cos, sn_cos)
 
 static SN_INSIDE sn_v1 sn_tanh_v(sn_work *w, sn_v1 a)
 {
@@ -139,13 +133,6 @@ static SN_INSIDE void sn_fill1(sn_v1 a, double value)
 {
     for (int64_t i = 0; i < a.n; i++)
         a.p[i * a.s] = value;
-}
-
-static SN_INSIDE void sn_fill2(const sn_v2 *a, double value)
-{
-    for (int64_t i = 0; i < a->n0; i++)
-        for (int64_t j = 0; j < a->n1; j++)
-            a->p[i * a->s0 + j * a->s1] = value;
 }
 
 static SN_INSIDE sn_v1 sn_copied1(sn_work *w, sn_v1 a)
@@ -179,17 +166,6 @@ static SN_INSIDE void sn_set1(sn_work *w, sn_v1 to, sn_v1 from)
             to.p[i * to.s] = from.p[i];
         w->top = top;
     }
-}
-
-static SN_INSIDE void sn_set2(sn_work *w, const sn_v2 *to, const sn_v2 *from)
-{
-    size_t top = w->top;
-    int64_t n0 = sn_same(w, to->n0, from->n0), n1 = sn_same(w, to->n1, from->n1);
-    const double *p = sn_copied2(w, from).p;
-    for (int64_t i = 0; i < n0; i++)
-        for (int64_t j = 0; j < n1; j++)
-            to->p[i * to->s0 + j * to->s1] = p[i * n1 + j];
-    w->top = top;
 }
 
 static SN_INSIDE sn_v1 sn_flat(sn_work *w, const sn_v2 *m)
@@ -264,26 +240,6 @@ static SN_INSIDE sn_v1 sn_dot_vm(sn_work *w, sn_v1 x, const sn_v2 *A)
     }
 #endif
     return sn_dot_mv(w, &t, x);
-}
-
-static SN_INSIDE sn_v2 sn_dot_mm(sn_work *w, const sn_v2 *A, const sn_v2 *B)
-{
-    sn_v2 r = sn_zeros2(w, A->n0, B->n1);
-    (void)sn_same(w, A->n1, B->n0);
-    for (int64_t i = 0; i < r.n0; i++)
-        for (int64_t j = 0; j < r.n1; j++) {
-            sn_v1 row = {A->p + i * A->s0, A->n1, A->s1}, column = {B->p + j * B->s1, B->n0, B->s0};
-            r.p[i * r.n1 + j] = sn_dot(w, row, column);
-        }
-    return r;
-}
-
-static SN_INSIDE double sn_sum1(sn_v1 a)
-{
-    double total = 0.0;
-    for (int64_t i = 0; i < a.n; i++)
-        total += a.p[i * a.s];
-    return total;
 }
 
 static SN_INSIDE double sn_largest(sn_work *w, sn_v1 a)

@@ -5,23 +5,13 @@ from __future__ import annotations
 import ast
 from typing import Protocol
 
-from ._scope import BOOL, FLOAT, INT, MATRIX, VECTOR, Scalar, Scope, Type, Value, View, length
+from ._scope import BOOL, FLOAT, INT, MATRIX, VECTOR, Scalar, Scope, Type, Value, View
 
 # Function of one number in numpy or math -> its name in C.
-_EACH = {
-    "sqrt": "sqrt", "sin": "sn_sin", "cos": "sn_cos", "tan": "sn_tan", "tanh": "sn_tanh", "exp": "sn_exp",
-    "log": "sn_log", "atan": "sn_atan", "arctan": "sn_atan", "asin": "sn_asin", "arcsin": "sn_asin",
-    "acos": "sn_acos", "arccos": "sn_acos", "fabs": "fabs", "abs": "fabs",
-}  # fmt: skip
-_PAIR = {"atan2": "sn_atan2", "arctan2": "sn_atan2", "hypot": "sn_hypot", "fmod": "fmod", "copysign": "copysign"}
-_TESTS = {"isfinite": "sn_finite", "isnan": "sn_nan", "isinf": "sn_infinite"}
-_ENTRYWISE = {
-    "sqrt": "sn_sqrt_v", "tanh": "sn_tanh_v", "exp": "sn_exp_v", "log": "sn_log_v", "sin": "sn_sin_v",
-    "cos": "sn_cos_v", "abs": "sn_absolute_v", "fabs": "sn_absolute_v", "sort": "sn_sorted", "copy": "sn_copied1",
-}  # fmt: skip
-_REDUCTIONS = {"max": "sn_largest(w, {})", "min": "sn_least(w, {})", "sum": "sn_sum1({})"}
-_LIKE = {"empty_like": "zeros", "zeros_like": "zeros", "ones_like": "ones"}
-_MADE = {"empty": 0.0, "zeros": 0.0, "ones": 1.0}
+_EACH = {"sqrt": "sqrt", "sin": "sn_sin", "cos": "sn_cos", "tanh": "sn_tanh", "exp": "sn_exp", "log": "sn_log"}
+_PAIR = {"atan2": "sn_atan2", "copysign": "copysign"}
+_ENTRYWISE = {"sqrt": "sn_sqrt_v", "tanh": "sn_tanh_v", "abs": "sn_absolute_v", "sort": "sn_sorted"}
+_REDUCTIONS = {"max": "sn_largest(w, {})", "min": "sn_least(w, {})"}
 
 
 class CallContext(Protocol):
@@ -31,30 +21,25 @@ class CallContext(Protocol):
 
     def evaluate_all(self, nodes: list[ast.expr]) -> list[Value]: ...
     def scalar(self, node: ast.expr, kind: Scalar) -> str: ...
-    def elementwise(self, node: ast.AST, name: str, left: Value, right: Value) -> Value: ...
     def truth(self, value: Value, node: ast.AST) -> str: ...
     def allocate(self, code: str, kind: Type) -> Value: ...
 
 
 def numpy_call(ex: CallContext, node: ast.AST, name: str, values: list[Value]) -> Value:
     """Return the C of `np.NAME(...)` or `math.NAME(...)`."""
-    if name in _MADE:
-        return _new_array(ex, node, values, whole=_whole(ex, node), value=_MADE[name])
+    if name in ("empty", "zeros"):
+        return _new_array(ex, node, values, whole=_whole(ex, node))
     if isinstance(node, ast.Call) and node.keywords:
         raise ex.scope.fail(node, "keyword arguments are not supported here.")
     kinds = [value.type for value in values]
     numbers = all(isinstance(kind, Scalar) for kind in kinds)
     if numbers and len(values) in (1, 2):
-        found = _of_numbers(name, [ex.scope.cast(value, FLOAT) for value in values], kinds[0] == INT)
+        found = _of_numbers(name, [ex.scope.cast(value, FLOAT) for value in values])
         if found is not None:
             return found
     if name == "dot" and len(values) == 2:
         return _dot(ex, node, values)
-    if name in ("minimum", "maximum") and len(values) == 2:
-        if numbers:
-            return _extreme(ex, node, name[:3], values)
-        return ex.elementwise(node, f"sn_{name}", *values)
-    if name in ("min", "max", "sum") and kinds == [MATRIX]:
+    if name in _REDUCTIONS and kinds == [MATRIX]:
         return Value(_REDUCTIONS[name].format(f"sn_flat(w, {ex.scope.argument(values[0])})"), FLOAT)
     if kinds == [VECTOR] and name in _REDUCTIONS:
         return Value(_REDUCTIONS[name].format(values[0].code), FLOAT)
@@ -62,21 +47,16 @@ def numpy_call(ex: CallContext, node: ast.AST, name: str, values: list[Value]) -
         return ex.allocate(f"{_ENTRYWISE[name]}(w, {values[0].code})", VECTOR)
     if kinds == [VECTOR] and name == "argsort":
         return ex.allocate(f"sn_order(w, {values[0].code})", View(1, True))
-    if kinds == [VECTOR] and name in _LIKE:
-        made = ex.allocate(f"sn_zeros1(w, {values[0].code}.n)", VECTOR)
-        if _LIKE[name] == "ones":
-            ex.scope.emit(f"sn_fill1({made.code}, 1.0);")
-        return made
     raise ex.scope.fail(node, f"there is no translation to C for `{name}` of these.")
 
 
-def _of_numbers(name: str, codes: list[str], whole: bool) -> Value | None:
+def _of_numbers(name: str, codes: list[str]) -> Value | None:
     if len(codes) == 2:
         return Value(f"{_PAIR[name]}({codes[0]}, {codes[1]})", FLOAT) if name in _PAIR else None
     if name in _EACH:
         return Value(f"{_EACH[name]}({codes[0]})", FLOAT)
-    if name in _TESTS:
-        return Value("1" if whole else f"{_TESTS[name]}({codes[0]})", BOOL)
+    if name == "isfinite":
+        return Value(f"sn_finite({codes[0]})", BOOL)
     if name in ("floor", "ceil"):
         # A whole number, as in math; numpy's float has the same value.
         return Value(f"sn_int(w, {name}({codes[0]}))", INT)
@@ -93,29 +73,21 @@ def _whole(ex: CallContext, node: ast.AST) -> bool:
     return whole
 
 
-def _new_array(ex: CallContext, node: ast.AST, values: list[Value], *, whole: bool, value: float) -> Value:
+def _new_array(ex: CallContext, node: ast.AST, values: list[Value], *, whole: bool) -> Value:
     """Return a new array; `np.empty` is filled with zeros."""
     if not isinstance(node, ast.Call) or len(node.args) != 1:
         raise ex.scope.fail(node, "one shape is needed.")
     shape = node.args[0]
     if isinstance(shape, ast.Tuple) and len(shape.elts) == 2 and not whole:
         sizes = [ex.scalar(size, INT) for size in shape.elts]
-        made = ex.allocate(f"sn_zeros2(w, {sizes[0]}, {sizes[1]})", MATRIX)
-        if value:
-            ex.scope.emit(f"sn_fill2(&{made.code}, {value});")
-        return made
-    if isinstance(shape, ast.Tuple) and len(shape.elts) == 3 and not whole and not value:
+        return ex.allocate(f"sn_zeros2(w, {sizes[0]}, {sizes[1]})", MATRIX)
+    if isinstance(shape, ast.Tuple) and len(shape.elts) == 3 and not whole:
         sizes = [ex.scalar(size, INT) for size in shape.elts]
         return ex.allocate(f"sn_zeros3(w, {', '.join(sizes)})", View(3))
     size = values[0]
     if size.type != INT:
         raise ex.scope.fail(node, "arrays are made with one to three dimensions.")
-    made = ex.allocate(f"sn_zeros{'_i' if whole else '1'}(w, {size.code})", View(1, whole))
-    if value and whole:
-        raise ex.scope.fail(node, "whole numbers are made as zeros.")
-    if value:
-        ex.scope.emit(f"sn_fill1({made.code}, {value});")
-    return made
+    return ex.allocate(f"sn_zeros{'_i' if whole else '1'}(w, {size.code})", View(1, whole))
 
 
 def _dot(ex: CallContext, node: ast.AST, values: list[Value]) -> Value:
@@ -127,9 +99,7 @@ def _dot(ex: CallContext, node: ast.AST, values: list[Value]) -> Value:
         return ex.allocate(f"sn_dot_mv{codes}", VECTOR)
     if a.type == VECTOR and b.type == MATRIX:
         return ex.allocate(f"sn_dot_vm{codes}", VECTOR)
-    if a.type == b.type == MATRIX:
-        return ex.allocate(f"sn_dot_mm{codes}", MATRIX)
-    raise ex.scope.fail(node, "products are supported for vectors and matrices.")
+    raise ex.scope.fail(node, "products are supported of vectors, or of a vector and a matrix.")
 
 
 def array_of(ex: CallContext, node: ast.Call) -> Value:
@@ -148,12 +118,10 @@ def method(ex: CallContext, node: ast.Call, name: str, base: Value) -> Value:
     """Return the C of `base.NAME(...)`."""
     if node.keywords or not isinstance(base.type, View) or base.type.whole:
         raise ex.scope.fail(node, "this method is not supported.")
-    if name in ("max", "min", "sum") and not node.args:
+    if name in _REDUCTIONS and not node.args:
         return numpy_call(ex, node, name, [base])
     if name == "copy" and not node.args and base.type.rank < 3:
         return ex.allocate(f"sn_copied{base.type.rank}(w, {ex.scope.argument(base)})", base.type)
-    if name in ("ravel", "flatten") and not node.args:
-        return base if base.type == VECTOR else ex.allocate(f"sn_flat(w, {ex.scope.argument(base)})", VECTOR)
     if name == "reshape":
         shape = node.args[0] if len(node.args) == 1 else ast.Tuple(node.args)
         sizes = shape.elts if isinstance(shape, ast.Tuple) else [shape]
@@ -181,19 +149,12 @@ def plain_call(ex: CallContext, node: ast.Call, name: str) -> Value:
         if name == "int":
             code = f"sn_int(w, {value.code})" if kinds[0] == FLOAT else ex.scope.cast(value, INT)
             return Value(code, INT)
-        if name == "abs":
-            return Value(f"{'fabs' if kinds[0] == FLOAT else 'sn_abs_i'}({value.code})", kinds[0])
-    if name == "len" and len(values) == 1 and isinstance(kinds[0], View):
-        return Value(length(values[0].code, kinds[0], 0), INT)
+        if name == "abs" and kinds[0] == FLOAT:
+            return Value(f"fabs({value.code})", FLOAT)
     if name in ("min", "max") and len(values) > 1 and all(isinstance(kind, Scalar) for kind in kinds):
-        return _extreme(ex, node, name, values)
+        kind = FLOAT if FLOAT in kinds else INT
+        code = ex.scope.cast(values[0], kind)
+        for value in values[1:]:
+            code = f"sn_{name}{'' if kind == FLOAT else '_i'}({code}, {ex.scope.cast(value, kind)})"
+        return Value(code, kind)
     raise ex.scope.fail(node, "this function is not supported.")
-
-
-def _extreme(ex: CallContext, node: ast.AST, name: str, values: list[Value]) -> Value:
-    del node
-    kind = FLOAT if any(value.type == FLOAT for value in values) else INT
-    code = ex.scope.cast(values[0], kind)
-    for value in values[1:]:
-        code = f"sn_{name}{'' if kind == FLOAT else '_i'}({code}, {ex.scope.cast(value, kind)})"
-    return Value(code, kind)

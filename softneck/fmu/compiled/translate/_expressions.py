@@ -24,15 +24,14 @@ from ._scope import (
     Type,
     Value,
     View,
-    common_type,
     length,
+    one_type,
     uniform,
 )
 
 _ARITHMETIC = {ast.Add: "add", ast.Sub: "sub", ast.Mult: "mul", ast.Div: "div"}
 _SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 _COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
-_BITS = {ast.BitXor: "^", ast.BitAnd: "&", ast.BitOr: "|"}
 _CONSTANTS = {"pi": "SN_PI", "inf": "HUGE_VAL", "nan": "sn_from_bits(0x7ff8000000000000u)", "e": "2.718281828459045"}
 # A product with a factor up to this cannot overflow int64, as `sn_int` limits whole numbers to 2^53.
 _SMALL_FACTOR = 512
@@ -99,8 +98,6 @@ class Expressions:
         if isinstance(node.value, ast.Name) and node.value.id in ("np", "math") and node.attr in _CONSTANTS:
             return Value(_CONSTANTS[node.attr], FLOAT)
         base = self.value(node.value)
-        if node.attr == "size" and isinstance(base.type, View):
-            return Value("(" + " * ".join(length(base.code, base.type, i) for i in range(base.type.rank)) + ")", INT)
         if node.attr == "T" and base.type in (VECTOR, MATRIX):
             return base if base.type == VECTOR else Value(f"sn_turned({self.scope.argument(base)})", MATRIX)
         raise self.scope.fail(node, "this attribute is not supported.")
@@ -119,11 +116,9 @@ class Expressions:
             return Value(f"(!{self.truth(value, node)})", BOOL, known)
         if isinstance(node.op, ast.USub) and value.type == VECTOR:
             return self.allocate(f"sn_negative_v(w, {value.code})", VECTOR)
-        if not isinstance(value.type, Scalar) or isinstance(node.op, ast.Invert):
+        if not isinstance(value.type, Scalar) or not isinstance(node.op, ast.USub):
             raise self.scope.fail(node, "this operator is not supported here.")
         kind = INT if value.type == BOOL else value.type
-        if isinstance(node.op, ast.UAdd):
-            return value
         return Value(f"(-{value.code})", kind, None if value.known is None else -value.known)
 
     def _binop(self, node: ast.BinOp) -> Value:
@@ -135,16 +130,12 @@ class Expressions:
     def binary(self, node: ast.AST, left: Value, right: Value) -> Value:
         """Return `left op right`; `node` holds the operator."""
         op: Any = type(node.op)  # type: ignore[attr-defined]
-        if op is ast.MatMult:
-            return numpy_call(self, node, "dot", [left, right])
         if isinstance(left.type, View) or isinstance(right.type, View):
             if op not in _ARITHMETIC:
                 raise self.scope.fail(node, "this operator is not supported between arrays.")
             return self.elementwise(node, f"sn_{_ARITHMETIC[op]}", left, right)
         if not (isinstance(left.type, Scalar) and isinstance(right.type, Scalar)):
             raise self.scope.fail(node, f"no arithmetic with {left.type} and {right.type}.")
-        if op in _BITS and left.type == right.type == INT:
-            return Value(f"({left.code} {_BITS[op]} {right.code})", INT)
         whole = FLOAT not in (left.type, right.type) and op is not ast.Div
         kind = INT if whole else FLOAT
         a, b = self.scope.cast(left, kind), self.scope.cast(right, kind)
@@ -183,23 +174,17 @@ class Expressions:
         n = exponent.known
         if not isinstance(base.type, Scalar) or n is None:
             raise self.scope.fail(node, "powers are supported for numbers, with a constant exponent.")
-        if n == 0.5:
-            return Value(f"sqrt({self.scope.cast(base, FLOAT)})", FLOAT)
-        if int(n) != n or abs(n) > _LARGEST_POWER or (base.type == INT and n < 0):
-            raise self.scope.fail(node, "powers are supported for whole exponents up to 16, and 0.5.")
-        if base.type == FLOAT or exponent.type == FLOAT:
-            return Value(f"sn_power_whole({self.scope.cast(base, FLOAT)}, {int(n)})", FLOAT)
-        raise self.scope.fail(node, "powers of whole numbers are not supported.")
+        if int(n) != n or abs(n) > _LARGEST_POWER or base.type != FLOAT:
+            raise self.scope.fail(node, "powers are supported of floats, for whole exponents up to 16.")
+        return Value(f"sn_power_whole({base.code}, {int(n)})", FLOAT)
 
     # Truth
 
     def truth(self, value: Value, node: ast.AST) -> str:
         """Return C for the truth value of `value` in Python."""
-        if value.type == BOOL:
-            return value.code
-        if not isinstance(value.type, Scalar):
-            raise self.scope.fail(node, "only numbers and Booleans are true or false.")
-        return f"({value.code} != 0)"
+        if value.type != BOOL:
+            raise self.scope.fail(node, "only Booleans are true or false.")
+        return value.code
 
     def _compare(self, node: ast.Compare) -> Value:
         values = self.evaluate_all([node.left, *node.comparators])
@@ -240,16 +225,16 @@ class Expressions:
             yes = self.value(node.body)
         with self.scope.capture() as no_lines:
             no = self.value(node.orelse)
-        kind = common_type(yes.type, no.type, self.scope.function)
+        kind = one_type(yes.type, no.type, self.scope.function)
         if not yes_lines and not no_lines and isinstance(kind, Scalar):
-            return Value(f"({test} ? {self.scope.cast(yes, kind)} : {self.scope.cast(no, kind)})", kind)
+            return Value(f"({test} ? {yes.code} : {no.code})", kind)
         name = self.scope.temporary(kind)
         self.scope.emit(f"if ({test}) {{")
         self.scope.lines += yes_lines
-        self.scope.emit(f"{name} = {self.scope.cast(yes, kind)};")
+        self.scope.emit(f"{name} = {yes.code};")
         self.scope.emit("} else {")
         self.scope.lines += no_lines
-        self.scope.emit(f"{name} = {self.scope.cast(no, kind)};")
+        self.scope.emit(f"{name} = {no.code};")
         self.scope.emit("}")
         return Value(name, kind)
 
@@ -300,35 +285,28 @@ class Expressions:
             return self._slice_of(node, base, kind, places[0])
         if len(places) == 2 and kind == MATRIX:
             first, second = places
-            if isinstance(first, ast.Slice) and not isinstance(second, ast.Slice):
-                column = Value(f"sn_column2(w, {self.scope.place(base)}, {self.place(second, base, kind, 1)})", VECTOR)
-                return column if _all(first) else self._slice_of(node, self.scope.store(column), VECTOR, first)
             if isinstance(second, ast.Slice) and not isinstance(first, ast.Slice):
-                row = Value(f"sn_row2(w, {self.scope.place(base)}, {self.place(first, base, kind, 0)})", VECTOR)
+                row = Value(f"sn_row2(w, {self.scope.place(base)}, {self.place(first)})", VECTOR)
                 return row if _all(second) else self._slice_of(node, self.scope.store(row), VECTOR, second)
         raise self.scope.fail(node, "this part of an array is not supported.")
 
     def _at(self, base: Value, kind: View, places: list[ast.expr]) -> Value:
         if kind.whole:
-            return Value(f"(*sn_at_i(w, {base.code}, {self.place(places[0], base, kind, 0)}))", INT)
+            return Value(f"(*sn_at_i(w, {base.code}, {self.place(places[0])}))", INT)
         if len(places) == kind.rank:
-            indices = ", ".join(self.place(place, base, kind, i) for i, place in enumerate(places))
+            indices = ", ".join(self.place(place) for place in places)
             return Value(f"(*sn_at{kind.rank}(w, {self.scope.argument(base)}, {indices}))", FLOAT)
         rows = base
         for i, place in enumerate(places):
             rank = kind.rank - i
-            rows = Value(
-                f"sn_row{rank}(w, {self.scope.argument(rows)}, {self.place(place, base, kind, i)})", View(rank - 1)
-            )
+            rows = Value(f"sn_row{rank}(w, {self.scope.argument(rows)}, {self.place(place)})", View(rank - 1))
         return rows
 
-    def place(self, node: ast.expr, base: Value, kind: View, dimension: int) -> str:
-        """Return C of an index; a negative constant counts from the end."""
+    def place(self, node: ast.expr) -> str:
+        """Return C of an index."""
         index = self.value(node)
-        if index.type != INT:
-            raise self.scope.fail(node, "an index must be a whole number.")
-        if index.known is not None and index.known < 0:
-            return f"({length(base.code, kind, dimension)} - {-index.known})"
+        if index.type != INT or (index.known is not None and index.known < 0):
+            raise self.scope.fail(node, "an index must be a whole number, counted from the start.")
         return index.code
 
     def _slice_of(self, node: ast.AST, base: Value, kind: View, cut: ast.Slice) -> Value:
@@ -338,8 +316,8 @@ class Expressions:
             return base
         if not base.code.isidentifier():
             base = self.scope.store(base)
-        low = "0" if cut.lower is None else self.place(cut.lower, base, kind, 0)
-        high = length(base.code, kind, 0) if cut.upper is None else self.place(cut.upper, base, kind, 0)
+        low = "0" if cut.lower is None else self.place(cut.lower)
+        high = length(base.code, kind, 0) if cut.upper is None else self.place(cut.upper)
         return Value(f"sn_cut{'2' if kind.rank == 2 else ''}(w, {self.scope.argument(base)}, {low}, {high})", kind)
 
     # Calls

@@ -74,16 +74,11 @@ def length(code: str, kind: View, dimension: int) -> str:
     return f"(int64_t){code}.n{'' if kind.rank == 1 else dimension}"
 
 
-def common_type(first: Type, second: Type, where: str) -> Type:
-    """Return the common type of two: whole numbers become floats, other types must be equal."""
-    if first == second:
-        return first
-    if isinstance(first, Scalar) and isinstance(second, Scalar):
-        return FLOAT if FLOAT in (first, second) else INT
-    if isinstance(first, Bundle) and isinstance(second, Bundle) and len(first.items) == len(second.items):
-        pairs = zip(first.items, second.items, strict=True)
-        return Bundle(tuple(common_type(a, b, where) for a, b in pairs))
-    raise TranslationError(f"{where}: one name has the types {first} and {second}.")
+def one_type(first: Type, second: Type, where: str) -> Type:
+    """Return the type of a name or a result, which has the same everywhere."""
+    if first != second:
+        raise TranslationError(f"{where} has the types {first} and {second}.")
+    return first
 
 
 class CTypes:
@@ -132,7 +127,7 @@ _PLACE = re.compile(r"(?:[a-z]\w*|\(\*\w+\)|v_\w+->arrays\[\d+\]\.v\d)(?:\.f\d+|
 class Scope:
     """Variables and lines of a function under translation.
 
-    `lines`: of C. `variables`: name -> type, widened from pass to pass. `allocates`: whether the function allocates
+    `lines`: of C. `variables`: name -> type. `allocates`: whether the function allocates
     workspace. `by_pointer`: parameter passed by pointer, or a named part of one -> C.
     """
 
@@ -142,7 +137,6 @@ class Scope:
         self.temporaries: list[tuple[str, Type]] = []
         self.allocates = False
         self.by_pointer: dict[str, str] = {}
-        self.widened = False
 
     def emit(self, line: str) -> None:
         """Write one line."""
@@ -153,14 +147,9 @@ class Scope:
         shown = ast.unparse(node) if isinstance(node, ast.expr | ast.stmt) else type(node).__name__
         return TranslationError(f"{self.function}: `{shown.splitlines()[0][:80]}`: {text}")
 
-    def bind(self, name: str, kind: Type) -> Type:
-        """Widen the type of a variable to include `kind` and return it."""
-        before = self.variables.get(name)
-        after = kind if before is None else common_type(before, kind, f"{self.function}: `{name}`")
-        if after != before:
-            self.variables[name] = after
-            self.widened = True
-        return after
+    def bind(self, name: str, kind: Type) -> None:
+        """Give a variable its type."""
+        one_type(self.variables.setdefault(name, kind), kind, f"{self.function}: `{name}`")
 
     def temporary(self, kind: Type) -> str:
         """Return the name of a new C variable."""
@@ -206,24 +195,12 @@ class Scope:
         return written
 
     def cast(self, value: Value, kind: Type) -> str:
-        """Return C that converts `value` to the wider type `kind`."""
+        """Return C of `value` as `kind`: numbers become floats, other types must be equal."""
         if value.type == kind:
             return value.code
-        if isinstance(value.type, Scalar) and isinstance(kind, Scalar):
-            if kind == FLOAT and value.known is not None:
-                return repr(float(value.known))
-            if kind == FLOAT:
-                return f"((double)({value.code}))"
-            if kind == INT and value.type == BOOL:
-                return f"((int64_t)({value.code}))"
-        if isinstance(value.type, Bundle) and isinstance(kind, Bundle):
-            held = self.store(value)
-            items = [
-                self.cast(Value(held.code + self.types.field(value.type, i), item), kind.items[i])
-                for i, item in enumerate(value.type.items)
-            ]
-            return self.make_tuple(items, kind)
-        raise TranslationError(f"{self.function}: {value.type} cannot become {kind}.")
+        if kind != FLOAT or not isinstance(value.type, Scalar):
+            raise TranslationError(f"{self.function}: {value.type} cannot become {kind}.")
+        return f"((double)({value.code}))" if value.known is None else repr(float(value.known))
 
     def make_tuple(self, items: list[str], kind: Bundle) -> str:
         """Return C of a tuple, in a new variable."""

@@ -8,18 +8,19 @@ from collections.abc import Callable
 from typing import Any
 
 from ._expressions import Expressions
-from ._scope import FLOAT, INT, MATRIX, NONE, VECTOR, Bundle, Scalar, Scope, Type, Value, View, common_type
+from ._scope import FLOAT, INT, MATRIX, NONE, VECTOR, Bundle, Scalar, Scope, Type, Value, View, one_type
 
 
 class Statements:
     """Translator of the statements of one function into its scope.
 
     Attributes:
-        result: type of the result, widened from pass to pass; None before the first `return`.
+        result: type of the result; None before the first `return`.
     """
 
-    def __init__(self, function: ast.FunctionDef, scope: Scope, expressions: Expressions, result: Type | None) -> None:
-        self.scope, self.ex, self.result = scope, expressions, result
+    def __init__(self, function: ast.FunctionDef, scope: Scope, expressions: Expressions) -> None:
+        self.scope, self.ex = scope, expressions
+        self.result: Type | None = None
         self._function = function
         names = (part for part in ast.walk(function) if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store))
         self._bound = Counter([name.id for name in names] + [argument.arg for argument in function.args.args])
@@ -36,12 +37,7 @@ class Statements:
 
     def _expr(self, node: ast.Expr) -> None:
         if not isinstance(node.value, ast.Constant):  # a docstring
-            value = self.ex.value(node.value)
-            if value.code and not value.code.isidentifier():
-                self.scope.emit(f"(void){value.code};" if value.type != NONE else f"{value.code};")
-
-    def _pass(self, node: ast.Pass) -> None:
-        del node
+            self.ex.value(node.value)  # a call writes a statement
 
     def _break(self, node: ast.Break) -> None:
         del node
@@ -51,53 +47,34 @@ class Statements:
         del node
         self.scope.emit("continue;")
 
-    def _raise(self, node: ast.Raise) -> None:
-        del node
-        self.scope.emit(f'sn_fault(w, "{self.scope.function}: refuses this model");')
-
     def _return(self, node: ast.Return) -> None:
         constant = isinstance(node.value, ast.Constant) and node.value.value is None
         if node.value is None or constant:
-            self._set_result(NONE, node)
+            self._set_result(NONE)
             self.scope.emit("goto leave;")
             return
         value = self.ex.value(node.value)
-        kind = self._set_result(value.type, node)
-        if kind != NONE:
-            self.scope.emit(f"result = {self.scope.cast(value, kind)};")
+        self._set_result(value.type)
+        self.scope.emit(f"result = {value.code};")
         self.scope.emit("goto leave;")
 
-    def _set_result(self, kind: Type, node: ast.AST) -> Type:
-        before = self.result
-        if before is not None and NONE in (kind, before) and kind != before:
-            raise self.scope.fail(node, "either all `return` statements have a value or none.")
-        self.result = kind if before is None else common_type(before, kind, self.scope.function)
-        self.scope.widened |= before is not None and self.result != before
-        return self.result
+    def _set_result(self, kind: Type) -> None:
+        self.result = one_type(self.result or kind, kind, f"{self.scope.function}: `return`")
 
     # Assignment
 
     def _assign(self, node: ast.Assign) -> None:
         if len(node.targets) == 1 and isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple):
             # All right sides are evaluated before any assignment; no tuple is made.
-            values = self.ex.evaluate_all(node.value.elts)
-            if len(values) == len(node.targets[0].elts):
-                held = values if len(values) == 1 else [self._own_copy(value) for value in values]
-                for target, value in zip(node.targets[0].elts, held, strict=True):
-                    self.assign(target, value)
-                return
+            values = [self.scope.store(value) for value in self.ex.evaluate_all(node.value.elts)]
+            for target, value in zip(node.targets[0].elts, values, strict=True):
+                self.assign(target, value)
+            return
         value = self.ex.value(_not_copied(node))
         if len(node.targets) > 1:
             value = self.scope.store(value)
         for target in node.targets:
             self.assign(target, value)
-
-    def _own_copy(self, value: Value) -> Value:
-        return value if value.known is not None else self.scope.store(value)
-
-    def _annassign(self, node: ast.AnnAssign) -> None:
-        if node.value is not None:
-            self.assign(node.target, self.ex.value(node.value))
 
     def assign(self, target: ast.expr, value: Value) -> None:
         """Write `target = value`."""
@@ -108,8 +85,8 @@ class Statements:
                 self.scope.variables.setdefault(target.id, value.type)
                 self.scope.by_pointer[target.id] = value.code
             elif target.id != "_":
-                kind = self.scope.bind(target.id, value.type)
-                self.scope.emit(f"v_{target.id} = {self.scope.cast(value, kind)};")
+                self.scope.bind(target.id, value.type)
+                self.scope.emit(f"v_{target.id} = {value.code};")
         elif isinstance(target, ast.Tuple):
             if not isinstance(value.type, Bundle) or len(value.type.items) != len(target.elts):
                 raise self.scope.fail(target, "the tuple has another length.")
@@ -144,12 +121,10 @@ class Statements:
             if place.type == INT and value.type == FLOAT:
                 raise self.scope.fail(node, "a float does not go into whole numbers.")
             self.scope.emit(f"{place.code} = {self.scope.cast(value, place.type)};")
-        elif place.type in (VECTOR, MATRIX) and isinstance(value.type, Scalar):
-            rank = 1 if place.type == VECTOR else 2
-            self.scope.emit(f"sn_fill{rank}({self.scope.argument(place)}, {self.scope.cast(value, FLOAT)});")
-        elif place.type in (VECTOR, MATRIX) and value.type == place.type:
-            rank = 1 if place.type == VECTOR else 2
-            self.scope.emit(f"sn_set{rank}(w, {self.scope.argument(place)}, {self.scope.argument(value)});")
+        elif place.type == VECTOR and isinstance(value.type, Scalar):
+            self.scope.emit(f"sn_fill1({place.code}, {self.scope.cast(value, FLOAT)});")
+        elif place.type == value.type == VECTOR:
+            self.scope.emit(f"sn_set1(w, {place.code}, {value.code});")
         else:
             raise self.scope.fail(node, f"{value.type} does not go into {place.type}.")
 
@@ -197,10 +172,8 @@ class Statements:
 
         def head() -> None:
             test = self.ex.value(node.test)
-            if test.known is None:
+            if not test.known:  # not `while True`
                 self.scope.emit(f"if (!{self.ex.truth(test, node)}) break;")
-            elif not test.known:
-                self.scope.emit("break;")
             self.scope.emit("sn_rounds(w, 1);")
 
         self._loop(node, "for (;;) {", head)
@@ -224,8 +197,8 @@ class Statements:
 
         def head() -> None:
             if target.id != "_":
-                kind = self.scope.bind(target.id, INT)
-                self.scope.emit(f"v_{target.id} = {self.scope.cast(Value(counter, INT), kind)};")
+                self.scope.bind(target.id, INT)
+                self.scope.emit(f"v_{target.id} = {counter};")
 
         self._loop(node, f"for (; {counter} {sign} {end}; {counter} += {step}) {{", head)
 
@@ -245,9 +218,9 @@ class Statements:
     def _carries(self, node: ast.For | ast.While) -> bool:
         """Return whether an array assigned in the loop may be read in a later iteration or after the loop."""
         bound = {
-            name.id for part in ast.walk(node) if isinstance(part, ast.Assign | ast.AnnAssign)
-            for target in ([part.target] if isinstance(part, ast.AnnAssign) else part.targets)
-            for name in ast.walk(target) if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)
+            name.id for part in ast.walk(node) if isinstance(part, ast.Assign)
+            for target in part.targets for name in ast.walk(target)
+            if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)
         }  # fmt: skip
         arrays = {name for name in bound if contains_array(self.scope.variables.get(name))}
         inside = {id(part) for part in ast.walk(node)}

@@ -45,7 +45,6 @@ _BY_HAND: dict[str, tuple[tuple[Type, ...], Type]] = {
     "slant_descend": ((MATRIX, VECTOR, MATRIX, VECTOR, VECTOR, FLOAT, VECTOR, VECTOR), NONE),
     "narx_push": ((VECTOR, VECTOR), NONE),
 }
-_MOST_PASSES = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,14 +98,6 @@ class Unit:
             f"{size.name}, {start.name}, {step.name}, {moved}}},"
         )
 
-    def tangent(self, module: str, ranks: tuple[int, ...]) -> str:
-        """Add the derivative of a runtime's step (see `softneck.runtime._tangent`), and return its name in C.
-
-        Raises TranslationError: it has a construct without translation.
-        """
-        runtime = _Runtime(self, with_tangent(bundle(module, loops=False)))
-        return _tangent_of(runtime, Arrays(ranks))
-
     def text(self) -> str:
         """Return the C file."""
         head = "/* Generated from the runtimes of softneck: do not edit. */\n"
@@ -115,7 +106,10 @@ class Unit:
         count = f"static const int sn_kind_count = {len(self.kinds)};\n"
         fast = self._fast()
         functions = [
-            _mark_fast(text) if defined_name(text) in fast else text.replace("\nstatic ", "\nSN_SMALL static ", 1)
+            # Fast functions are inline, with inline checks of whole numbers.
+            text.replace("sn_int(", "sn_int_here(").replace("\nstatic ", "\nstatic inline ", 1)
+            if defined_name(text) in fast
+            else text.replace("\nstatic ", "\nSN_SMALL static ", 1)
             for text in self.functions
         ]
         return "\n".join([head, guard, *self.types.declarations, "", *functions, table, count, "#endif\n"])
@@ -175,19 +169,11 @@ class _Runtime:
         by_pointer = {
             name: f"(*v_{name})" for name, kind in variables.items() if is_passed_by_pointer(kind) and name not in bound
         }
-        result: Type | None = None
-        for _ in range(_MOST_PASSES):
-            scope = Scope(node.name, self.unit.types, variables)
-            scope.by_pointer = by_pointer
-            statements = Statements(node, scope, Expressions(scope, self.constants, self._call), result)
-            statements.block(node.body)
-            settled = not scope.widened and statements.result == result
-            result = statements.result
-            if settled:
-                break
-        else:
-            raise TranslationError(f"`{node.name}`: the types of its variables do not converge.")
-        result = NONE if result is None else result
+        scope = Scope(node.name, self.unit.types, variables)
+        scope.by_pointer = by_pointer
+        statements = Statements(node, scope, Expressions(scope, self.constants, self._call))
+        statements.block(node.body)
+        result = NONE if statements.result is None else statements.result
         text = self._text(node, names, arguments, scope, result)
         made = self.unit.keep(re.sub(r"\W", "_", node.name), text)
         return _TranslatedFunction(made, result, tuple(name in by_pointer for name in names))
@@ -197,11 +183,8 @@ class _Runtime:
     ) -> str:
         spell = self.unit.types.name
         given = dict(zip(names, arguments, strict=True))
-        widened = [name for name in names if scope.variables[name] != given[name]]
         declared = [
-            f"const {spell(kind)} *v_{name}"
-            if name in scope.by_pointer
-            else f"{spell(kind)} {'a' if name in widened else 'v'}_{name}"
+            f"const {spell(kind)} *v_{name}" if name in scope.by_pointer else f"{spell(kind)} v_{name}"
             for name, kind in given.items()
         ]
         # A returned array may be in the workspace: then the caller releases it.
@@ -209,14 +192,11 @@ class _Runtime:
         own = [
             (f"v_{name}", kind)
             for name, kind in scope.variables.items()
-            if (name not in given and name not in scope.by_pointer) or name in widened
+            if name not in given and name not in scope.by_pointer
         ]
         lines = [f"{spell(kind)} {name}{_zero(kind)};" for name, kind in own + scope.temporaries]
         lines += ["size_t top = w->top;"] if releases else []
         lines += [f"{spell(result)} result{_zero(result)};"] if result != NONE else []
-        lines += [
-            f"v_{name} = {scope.cast(Value(f'a_{name}', given[name]), scope.variables[name])};" for name in widened
-        ]
         lines += [f"(void){name};" for name in ("w", *(f"v_{name}" for name in names))]
         lines += scope.lines
         lines += ["leave: ;"] if "goto leave;" in scope.lines else []
@@ -268,11 +248,6 @@ class _Runtime:
 def _tangent_of(runtime: _Runtime, arrays: Arrays) -> str:
     rows = (MATRIX, MATRIX, MATRIX)
     return runtime.function("step_tangent", (arrays, VECTOR, VECTOR, VECTOR, VECTOR, *rows, INT)).name
-
-
-def _mark_fast(text: str) -> str:
-    """Return a function as inline, with inline checks of whole numbers."""
-    return text.replace("sn_int(", "sn_int_here(").replace("\nstatic ", "\nstatic inline ", 1)
 
 
 def _constants(tree: ast.Module) -> dict[str, ast.expr]:
