@@ -38,7 +38,7 @@ def test_help_takes_the_kind_on_either_side_and_without_one_lists_none(call: Cal
 
 def test_a_default_is_shown_as_set_takes_it(call: Call) -> None:
     said = call("identify", "rls", "--help").out
-    assert all(f"  {shown} " in said for shown in ("delay=...", "stable=false", "structure=siso", "na=1"))
+    assert all(f"  {shown} " in said for shown in ("delay=...", "forgetting=1", "structure=siso", "na=1"))
 
 
 def test_a_kind_s_own_word_on_a_setting_goes_before_the_inherited_one() -> None:

@@ -164,7 +164,7 @@ def test_what_it_learns_is_what_the_kit_s_recursion_learns() -> None:
     Phi = np.column_stack([-bands[0][rows - 1], bands[1][rows - 5]])
     recursion = Recursion(
         parameters=2, forgetting=learning.forgetting, covariance_bound=learning.covariance_bound,
-        dead_zone=learning.dead_zone, poles=1, pole_radius=1.0, start_covariance=1.0,
+        dead_zone=learning.dead_zone, poles=1, start_covariance=1.0,
     )  # fmt: skip
     found = recursion.run(recursion.initial_state([-POLE, B]), Phi, bands[0][rows])[0].theta
     theta = memory(part.block, part._state, "theta", 0)

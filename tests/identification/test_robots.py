@@ -189,7 +189,7 @@ def test_networks_of_the_same_rows_at_another_sample_time_are_the_same(kind: str
 @pytest.mark.parametrize("sample_time", slow_but([0.02, 1.0], [], [1.0]))
 def test_a_family_holds_the_truth_of_each_axis(name: str, sample_time: float, tmp_path: Path) -> None:
     recording = recorded(ROBOTS[name], sample_time=sample_time, rows=500, noise=1e-4, rest=0.3)
-    family = FamilySettings(window=4.0, weight_order=1).fit(recording)
+    family = FamilySettings(window=4.0).fit(recording)
     assert list(family.axes) == list(recording.robot.outputs.names)
     assert family.directions is not None
     np.testing.assert_allclose(family.directions, weights_of(recording.robot))

@@ -132,7 +132,7 @@ _OF_CHANNELS = {
     "least_cocontraction",
     "minimum_tautness",
 }
-_ANGLES = {"phase_margin", "inclination_step", "angle_limit"}
+_ANGLES = {"phase_margin", "angle_limit"}
 
 
 def in_si(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
@@ -189,15 +189,12 @@ def kind_command(role: str, kind: str | None = None) -> type[click.Command]:
             super().format_options(ctx, formatter)
             asked = ctx.meta.get(__name__, kind)
             if asked is not None:
-                _write_settings(asked, formatter)
+                head = f"Settings of {asked} (--set KEY=VALUE; angles in rad, or KEY_deg=VALUE; ... is None)"
+                with formatter.section(head):
+                    rows = settings_of(resolve(KINDS[asked].settings))
+                    formatter.write_dl([(f"{name}={value}", text) for name, value, text in rows], col_max=36)
 
     return KindCommand
-
-
-def _write_settings(kind: str, formatter: click.HelpFormatter) -> None:
-    with formatter.section(f"Settings of {kind} (--set KEY=VALUE; angles in rad, or KEY_deg=VALUE; ... is None)"):
-        rows = settings_of(resolve(KINDS[kind].settings))
-        formatter.write_dl([(f"{name}={value}", text) for name, value, text in rows], col_max=36)
 
 
 def settings_of(settings: type) -> list[tuple[str, str, str]]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import SettingsError, Vector, require_positive, require_whole
+from softneck.core import SettingsError, Vector, require_positive
 
 if TYPE_CHECKING:
     import control
@@ -23,17 +23,16 @@ _LEAST_POLE = 1e-9
 
 
 def makeweight(
-    low: float, corner: tuple[float, float] | float, high: float, *, order: int = 1, dt: float | None = None
+    low: float, corner: tuple[float, float] | float, high: float, *, dt: float | None = None
 ) -> control.TransferFunction:
     """Return W with `|W| = low` at rest, `high` far up, and a given size between them.
 
-    `W = ((h s + l p)/(s + p))^order` with l, h the order-th roots; p follows from the corner (MATLAB's makeweight).
+    `W = (high s + low p)/(s + p)`; p follows from the corner (MATLAB's makeweight).
 
     Args:
         low: gain at frequency zero; finite: an integrator in a weight has no stabilising solution.
         corner: frequency [rad/s] and the size there; a frequency alone means size 1.
         high: gain far up.
-        order: of W.
         dt: sample time [s]; None for a continuous weight. The size at the corner is exact in both.
 
     Raises:
@@ -44,20 +43,16 @@ def makeweight(
     frequency, size = corner if isinstance(corner, tuple) else (float(corner), 1.0)
     for name, value in (("low", low), ("high", high), ("corner", frequency), ("size at the corner", size)):
         require_positive(name, value)
-    require_whole("order", order, 1, 4)
     if not min(low, high) < size < max(low, high):
         raise SettingsError(
             f"the size {size:g} at the corner must lie between `low` {low:g} and `high` {high:g}; "
             "otherwise no weight of one slope passes through all three."
         )
-    l, h, m = (value ** (1.0 / order) for value in (low, high, size))
     w = float(warp_frequency(np.array([frequency]), dt)[0]) if dt else frequency
     if not 0.0 < w < math.inf or (dt and frequency >= math.pi / dt):
         raise SettingsError(f"the corner {frequency:g} rad/s must be below the Nyquist frequency of dt = {dt} s.")
-    p = w * math.sqrt((h**2 - m**2) / (m**2 - l**2))
-    above, below = np.array([1.0]), np.array([1.0])
-    for _ in range(order):
-        above, below = np.convolve(above, [h, l * p]), np.convolve(below, [1.0, p])
+    p = w * math.sqrt((high**2 - size**2) / (size**2 - low**2))
+    above, below = np.array([high, low * p]), np.array([1.0, p])
     return control.TransferFunction(above, below) if not dt else _discretize(above, below, dt)
 
 

@@ -99,8 +99,7 @@ class Recursion:
         covariance_bound: on the trace of F; without excitation and with forgetting F grows exponentially (to 1e30
             within minutes at 0.99). 0 for none.
         dead_zone: errors up to this size [unit of y] change nothing.
-        poles: number of the first parameters that are a_1, a_2, ... of Eq. 23, kept stable; 0 for no projection.
-        pole_radius: bound on those poles; a step beyond it is halved until it is within.
+        poles: number of the first parameters that are a_1, a_2, ... of Eq. 23, kept stable (a step is halved); 0: none.
         start_covariance: diagonal of F(0).
     """
 
@@ -109,7 +108,6 @@ class Recursion:
     covariance_bound: float = 0.0
     dead_zone: float = 0.0
     poles: int = 0
-    pole_radius: float = 1.0
     start_covariance: float = EXACT_START
 
     def __post_init__(self) -> None:
@@ -118,7 +116,6 @@ class Recursion:
         require_between("covariance_bound", self.covariance_bound, 0.0, 1e300)
         require_between("dead_zone", self.dead_zone, 0.0, 1e300)
         require_whole("poles", self.poles, 0, self.parameters)
-        require_between("pole_radius", self.pole_radius, 1e-3, 1.0)
         require_positive("start_covariance", self.start_covariance)
 
     def initial_state(self, theta: ArrayLike | None = None) -> RecursionState:
@@ -157,7 +154,7 @@ class Recursion:
         )
         n = self.parameters
         history = np.zeros((len(y) if keep else 0, 1 + 2 * n))
-        guards = np.array([self.forgetting, self.covariance_bound, self.dead_zone, self.poles, self.pole_radius])
+        guards = np.array([self.forgetting, self.covariance_bound, self.dead_zone, self.poles, 1.0])
         load_functions(_UD_RUNTIME).ud_guarded(
             Phi, y, after.theta, after.factor, after.scale, guards, after.tally, history
         )
@@ -189,7 +186,6 @@ class Rls:
         structure: "siso" over theta_i and phi_i, "miso" (each output from the three motors and its own past) or
             "mimo" (from the three motors and both pasts).
         covariance_bound: on the trace of F where `forgetting` is below 1; 0 for none.
-        stable: halve a step that would make a pole unstable (not for "mimo").
     """
 
     na: int = 1
@@ -199,7 +195,6 @@ class Rls:
     forgetting: float = 1.0
     structure: str = "siso"
     covariance_bound: float = 1e8
-    stable: bool = False
 
     def __post_init__(self) -> None:
         # 100 samples are 2 s at 20 ms, ten time constants of a neck.
@@ -209,15 +204,12 @@ class Rls:
         require_forgetting(self.forgetting)
         require_one_of("structure", self.structure, STRUCTURES)
         require_between("covariance_bound", self.covariance_bound, 0.0, 1e15)
-        if self.stable and self.structure == "mimo":
-            raise SettingsError("`stable` watches the poles of one output; use structure `siso` or `miso` with it.")
 
     def _recursion(self, parameters: int) -> Recursion:
         return Recursion(
             parameters=parameters,
             forgetting=self.forgetting,
             covariance_bound=self.covariance_bound if self.forgetting < 1.0 else 0.0,
-            poles=self.na if self.stable else 0,
             start_covariance=EXACT_START,
         )
 

@@ -57,9 +57,8 @@ def envelope_weight(frequency: Vector, envelope: Vector, order: int) -> tuple[Ve
 
     `|W|^2 = N(w^2)/D(w^2)`: for a given closeness gamma, `e^2 D <= N <= gamma^2 e^2 D` is linear in the coefficients;
     the least gamma is found by bisection, W by spectral factorisation (Balas et al. 2007, `ucover`). `frequency` (m,)
-    rises [rad/s]; SettingsError for another order, or an envelope that is not positive and finite.
+    rises [rad/s]; SettingsError for an envelope that is not positive and finite.
     """
-    require_whole("order", order, 1, 3)
     e = np.asarray(envelope, dtype=np.float64)
     if not np.isfinite(e).all() or e.max() <= 0.0:
         raise SettingsError("the envelope must be finite and not zero; the family's samples are all alike.")
@@ -166,6 +165,8 @@ def cross_gains(
 _FREQUENCY_COUNT = 100
 # [s] of a window: Eq. 22 goes through several of its waves.
 _WINDOW_S = 8.0
+# Width of the operating points, of scaled outputs [rad], and the order of W.
+_INCLINATION_STEP, _WEIGHT_ORDER = float(np.radians(7.5)), 2
 # Of a window [scaled s]: 5 time constants hold a response, 5,000 several operating points.
 _MIN_WINDOW_S, _MAX_WINDOW_S = 1.0, 1000.0
 # From a tenth of the neck's slowest time constants.
@@ -187,18 +188,14 @@ class FamilySettings:
 
     Attributes:
         window: length of a window [s]; shorter runs are one window. None: 40 time constants, of a neck 8 s.
-        inclination_step: width of the operating points, of scaled outputs [rad].
         directions: sectors of direction; 1 takes all together.
-        weight_order: of W, 1 to 3.
         max_delay: bound on dead times [s]; None: one and a half time constants, of a neck 0.3 s.
         source: "set_points", or "positions" of the motors.
         confidence: of each circle of the measured frequency responses that the weight of the data covers.
     """
 
     window: float | None = None
-    inclination_step: float = float(np.radians(7.5))
     directions: int = 4
-    weight_order: int = 2
     max_delay: float | None = None
     source: str = "set_points"
     confidence: float = 0.95
@@ -207,9 +204,7 @@ class FamilySettings:
         for name in ("window", "max_delay"):
             if (seconds := getattr(self, name)) is not None:
                 require_positive(name, seconds, "s")
-        require_between("inclination_step", self.inclination_step, 0.001, np.pi, "rad")
         require_whole("directions", self.directions, 1, 72)
-        require_whole("weight_order", self.weight_order, 1, 3)
         require_one_of("source", self.source, SOURCES)
         require_between("confidence", self.confidence, 0.5, 0.9999)
 
@@ -367,7 +362,7 @@ class FamilySettings:
         points: dict[tuple[int, int, int], list[Window]] = {}
         for window in useful:
             sector = round(window.direction / (2 * np.pi) * self.directions) % self.directions
-            key = (window.recording, int(window.inclination / self.inclination_step), sector)
+            key = (window.recording, int(window.inclination / _INCLINATION_STEP), sector)
             points.setdefault(key, []).append(window)
         found = [*there]
         found += [fit_local(search, group, axis, scope="point", near=near) for _, group in sorted(points.items())]
@@ -413,7 +408,7 @@ class FamilySettings:
     def _weight(
         self, frequency: Vector, envelope: Vector, plants: np.ndarray, nominal: Vector, sample_time: float
     ) -> tuple[Vector, Vector]:
-        above, below = envelope_weight(frequency, envelope, self.weight_order)
+        above, below = envelope_weight(frequency, envelope, _WEIGHT_ORDER)
         # Between the grid's points the samples may stand a little higher than its lines.
         w = np.geomspace(frequency[0], frequency[-1], 5 * frequency.size)
         W = np.abs(np.polyval(above, 1j * w) / np.polyval(below, 1j * w))

@@ -108,9 +108,7 @@ def redefined_only(P: np.ndarray) -> np.ndarray:
     return P - P.mean(axis=1, keepdims=True)
 
 
-def test_settings_that_contradict_each_other_are_refused() -> None:
-    with pytest.raises(SettingsError, match="`stable` watches the poles of one output"):
-        Rls(structure="mimo", stable=True)
+def test_forgetting_is_a_part() -> None:
     for value in (0.0, 1.5):
         with pytest.raises(SettingsError, match="`forgetting` must be"):
             Rls(forgetting=value)

@@ -111,20 +111,20 @@ def test_in_the_dead_zone_nothing_changes() -> None:
     assert state.tally.tolist() == [0.0, 0.0, 50.0, 0.0]
 
 
-def test_the_projection_keeps_the_poles_within_their_radius() -> None:
+def test_the_projection_keeps_the_poles_stable() -> None:
     rng = np.random.default_rng(3)
     y = np.cumsum(rng.standard_normal(400)) * np.linspace(1.0, 4.0, 400)  # grows: its best model is unstable
     Phi = np.column_stack([-y[1:-1], -y[:-2], rng.standard_normal(398)])
     free = Recursion(parameters=3, forgetting=0.95)
     _, wild = free.run(free.initial_state(), Phi, y[2:], keep=True)
-    kept = Recursion(parameters=3, forgetting=0.95, poles=2, pole_radius=0.98)
+    kept = Recursion(parameters=3, forgetting=0.95, poles=2)
     state, tame = kept.run(kept.initial_state(), Phi, y[2:], keep=True)
 
     def radius(theta: Vector) -> float:
         return float(np.abs(np.roots([1.0, *theta[:2]])).max())
 
     assert max(radius(theta) for theta in wild.theta) > 1.0
-    assert max(radius(theta) for theta in tame.theta) < 0.98 + 1e-9  # rounding of the roots
+    assert max(radius(theta) for theta in tame.theta) < 1.0 + 1e-9  # rounding of the roots
     assert state.tally[3] > 0
 
 

@@ -222,7 +222,7 @@ def test_what_cannot_be_made_a_family_is_named(recordings: list[Recording]) -> N
         FamilySettings().fit([recordings[0], other])
     with pytest.raises(SettingsError, match=r"`window` must be between 1 and 1000 \[s\]"):
         FamilySettings(window=0.1).fit(recordings)
-    for key, value in (("weight_order", 4), ("window", -1.0), ("directions", 0)):
+    for key, value in (("window", -1.0), ("directions", 0)):
         with pytest.raises(SettingsError, match=f"`{key}` must be"):
             FamilySettings(**cast(Any, {key: value}))
 
