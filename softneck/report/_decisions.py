@@ -67,14 +67,11 @@ def auto_decision(facts: Values) -> str:
         return f"Do not use {facts['model']} ({facts['chosen']}): simulation fit {list_fits(fits, linear)}."
     said = f"Use {facts['model']} ({facts['chosen']}): on rows it has not seen it simulates {list_fits(fits, linear)}."
     limits = trust_limits(judged["measured_range"], judged.get("unit", "deg"))
-    worst = "" if chosen["fit"] is None else f"Worst test: {percent(chosen['fit'])} % ({_test_words(chosen['worst'])})."
+    more = " with the median of all kinds on motions that nobody recorded" if chosen["worst"] == EXAM else ""
+    worst = "" if chosen["fit"] is None else f"Worst test: {percent(chosen['fit'])} % ({chosen['worst']}{more})."
     return " ".join(
         filter(None, [said, f"Do not trust it {limits}: it was not judged there." if limits else "", worst])
     )
-
-
-def _test_words(test: str) -> str:
-    return f"{test} with the median of all kinds on motions that nobody recorded" if test == EXAM else test
 
 
 def _least(fit: float | None) -> float:

@@ -149,7 +149,9 @@ class ControllerLimits:
     robot: Robot = field(default_factory=Robot.preset)
 
     def __post_init__(self) -> None:
-        require_limits({name: getattr(self, name) for name in LIMITS})
+        for name in LIMITS:
+            check = require_finite if name.startswith("least_") else require_positive
+            check(name, getattr(self, name))
         largest, unit = nominal_ends(self.robot), to_si(self.robot.motors.unit)[1]
         if largest is not None:
             least = 0.01 * largest / MAX_MOTOR
@@ -237,13 +239,6 @@ def limits_of(robot: Robot, *, lead_limit: float | None, least_cocontraction: fl
         lead_limit=2.0 * most if lead_limit is None else lead_limit,
         least_cocontraction=-(largest or most) if least_cocontraction is None else least_cocontraction,
     )  # fmt: skip
-
-
-def require_limits(limits: Mapping[str, float]) -> None:
-    """Raise SettingsError for limits that are none of any robot: how far its motors go is known when it is."""
-    for name, value in limits.items():
-        check = require_finite if name.startswith("least_") else require_positive
-        check(name, value)
 
 
 def _require_room(name: str, value: float, position_limit: float, unit: str) -> None:

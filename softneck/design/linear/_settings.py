@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -351,8 +352,10 @@ class AxisSettings(LoopSettings, ABC):
         def excess(speed: float) -> float:
             """Return how far the distance to -1 is below the one required; at most 0 where it is kept."""
             nonlocal best
-            found = _try_build(build, speed)
-            peak = math.inf if found is None else self._sensitivity(found.controller, axis)
+            found, peak = None, math.inf
+            with contextlib.suppress(SettingsError):  # the synthesis has no solution
+                found = build(speed)
+                peak = self._sensitivity(found.controller, axis)
             if peak <= self.max_sensitivity:
                 best = found
             elif speed == low:
@@ -458,14 +461,6 @@ def _fastest_filter(plant: AxisPlant) -> int:
 def _slowest_filter(plant: AxisPlant) -> int:
     """Return the slowest reference filter that is tried [samples]: 2 s of a neck at 20 ms."""
     return max(_MAX_FILTER_SAMPLES, math.ceil(2.0 * plant.second / plant.sample_time))
-
-
-def _try_build(build: Callable[[float], AxisDesign], speed: float) -> AxisDesign | None:
-    """Return the result of `build`, or None if the synthesis has no solution."""
-    try:
-        return build(speed)
-    except SettingsError:
-        return None
 
 
 def margins_json(margins: Margins) -> dict[str, float | None]:

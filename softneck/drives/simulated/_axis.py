@@ -10,8 +10,8 @@ from softneck.core import Vector
 
 from . import _servo_runtime as servo
 from ._profiles import Item, Profile
-from ._quirks import DriveQuirks
-from ._sdo import NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRONG_LENGTH, WRONG_VALUE
+from ._quirks import NOT_TOLD, DriveQuirks
+from ._sdo import NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRITE_ONLY, WRONG_LENGTH, WRONG_VALUE
 
 # Current in internal units: A x 65520 / (2 I_peak).
 _CURRENT_RANGE = 65520.0
@@ -135,8 +135,8 @@ class Axis:
         item = self.profile.items.get((index, subindex))
         if item is None or index in self.quirks.lacks:
             return self._not_there(index)
-        if code := self.quirks.unreadable(index):
-            return code
+        if self.quirks.write_only and index in NOT_TOLD:
+            return WRITE_ONLY
         if not item.size:
             return (self.device_name if index == 0x1008 else item.text).encode("ascii")
         getter = self.getters.get((index, subindex))

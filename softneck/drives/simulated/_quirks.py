@@ -12,12 +12,12 @@ from typing import Any
 
 from softneck.core import SettingsError, require_between, require_one_of, require_whole
 
-from ._sdo import WRITE_ONLY, WRONG_STATE, WRONG_VALUE
+from ._sdo import WRONG_STATE, WRONG_VALUE
 
 # The object of the mode, and those that may be write-only: control word, mode, homing method, interpolation period,
 # target speed.
 _MODE_OBJECT = 0x6060
-_NOT_TOLD = frozenset({0x6040, _MODE_OBJECT, 0x6098, 0x60C2, 0x60FF})
+NOT_TOLD = frozenset({0x6040, _MODE_OBJECT, 0x6098, 0x60C2, 0x60FF})
 # Objects that a run needs, so that no drive may lack them.
 _NEEDED = frozenset({0x1000, 0x1018, 0x1400, 0x1600, 0x1800, 0x1A00, 0x6040, 0x6041, _MODE_OBJECT, 0x6064, 0x607A})
 _KNOWN_MODES = (1, 3, 6, 8)
@@ -47,10 +47,6 @@ class DriveQuirks:
         require_whole("twin", self.twin, 0, 126)
         if needed := sorted(_NEEDED.intersection(self.lacks)):
             raise SettingsError(f"`lacks` may not hold {needed[0]:04X}h: every drive has it.")
-
-    def unreadable(self, index: int) -> int:
-        """Return the SDO abort code for reading an object, or 0 if it is readable."""
-        return WRITE_ONLY if self.write_only and index in _NOT_TOLD else 0
 
     def unwritable(self, index: int, value: int, *, enabled: bool) -> int:
         """Return the SDO abort code for writing a value to an object, or 0 if it is accepted."""

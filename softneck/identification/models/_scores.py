@@ -19,9 +19,7 @@ def nrmse_fit(measured: Vector, predicted: Vector) -> float:
 
 def r_squared(measured: Vector, predicted: Vector) -> float:
     """Return `R2 = 1 - SSE/SST = 1 - (1 - fit/100)^2`; NaN where y was not measured or is constant."""
-    y, yhat = _measured_pairs(measured, predicted)
-    total = float(np.sum((y - y.mean()) ** 2)) if _varies(y) else 0.0
-    return 1.0 - float(np.sum((y - yhat) ** 2)) / total if total > 0 else float("nan")
+    return 1.0 - (1.0 - nrmse_fit(measured, predicted) / 100.0) ** 2
 
 
 def rmse(measured: Vector, predicted: Vector) -> float:
@@ -38,6 +36,14 @@ def worst_error(measured: Vector, predicted: Vector) -> tuple[float, int]:
         return float("nan"), -1
     row = int(np.nanargmax(size))
     return float(size[row]), row
+
+
+def no_worse(scores: Vector, best: Vector) -> bool:
+    """Return whether scores of segments are above the best by no more than one standard error of the difference."""
+    with np.errstate(invalid="ignore"):
+        more = scores - best
+        error = more.std(ddof=1) / np.sqrt(more.size) if more.size > 1 else 0.0
+        return bool(more.mean() <= error)
 
 
 def _varies(y: Vector) -> bool:

@@ -29,6 +29,7 @@ from softneck.signals import Recording, concatenate, conditions, merge_condition
 from ..models._arrays import check_arrays
 from ..models._fitting import ScaledData, sensor_noise
 from ..models._model import WARM_UP, Model, embed_model, embedded_model
+from ..models._scores import no_worse
 from ..structured._greybox_draws import GreyBoxDraws
 from ..structured._play_draws import PlayDraws
 
@@ -245,7 +246,7 @@ def make_draws(
     if not math.isfinite(float(best.mean())):
         raise DataError("no draw has a finite simulation on the held-out motions; record longer.")
     options = product(winner.smoother(), _FACTORS)
-    source, factor = next(option for option in options if _no_worse(judged(*option)[0], best))
+    source, factor = next(option for option in options if no_worse(judged(*option)[0], best))
     Y = judged(source, factor)[1]
     share, keep = motions.disturbance(Y, memory)
     more = next((more for more in _MORE if motions.covers(Y, more * share, keep)), _MORE[-1])
@@ -264,14 +265,6 @@ def make_draws(
 
 def _arrays(source: Source, factor: float, draws: Sequence[Vector]) -> list[dict[str, Matrix]]:
     return side_by_side([partial(source.arrays, draw, factor) for draw in draws])
-
-
-def _no_worse(scores: Vector, best: Vector) -> bool:
-    """Return whether scores of segments are above the best by no more than one standard error of the difference."""
-    with np.errstate(invalid="ignore"):
-        more = scores - best
-        error = more.std(ddof=1) / math.sqrt(more.size) if more.size > 1 else 0.0
-        return bool(more.mean() <= error)
 
 
 def _motion(recording: Recording) -> list[float]:

@@ -19,6 +19,7 @@ from softneck.signals import Recording
 
 from ..linear._srivc_fit import Continuous, Runs, SrivcFit, SrivcFitOptions
 from ..models._directions import Directions
+from ..models._scores import no_worse
 from ._frf_fit import SUPPORTED, FrequencyResponse, frequency_response
 from ._local_models import axis_inputs
 from ._local_polynomial import ComplexArray
@@ -42,15 +43,10 @@ def choose_order(search: SrivcFitOptions, runs: Runs, near: Continuous) -> tuple
     if not errors:
         return None, rms
     best = min(errors, key=lambda n: float(errors[n].mean()))
-    order = next(n for n in sorted(errors) if n == best or _as_good(errors[n] - errors[best]))
+    order = next(n for n in sorted(errors) if n == best or no_worse(errors[n], errors[best]))
     start = squares[order][0]
     fit = replace(search, order=order).improve(runs, start.model, start.starts)
     return (start if fit is None else fit).model, rms
-
-
-def _as_good(worse: Vector) -> bool:
-    """Return whether errors are larger by no more than one standard error of the difference."""
-    return bool(worse.mean() <= worse.std(ddof=1) / np.sqrt(worse.size))
 
 
 def _held_out(search: SrivcFitOptions, runs: Runs, near: Continuous) -> tuple[SrivcFit, Vector] | None:

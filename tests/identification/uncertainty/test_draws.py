@@ -71,14 +71,14 @@ def test_draws_follow_their_seed_and_no_two_are_the_same(made: Callable[..., Dra
 def test_a_factor_is_as_good_as_the_best_within_one_standard_error() -> None:
     best, spread = np.full(4, 0.1), np.array([-0.1, 0.1, -0.1, 0.1])
     error = spread.std(ddof=1) / 2.0  # four segments
-    assert _draws._no_worse(best, best)
-    assert _draws._no_worse(best + spread + 0.99 * error, best)
-    assert not _draws._no_worse(best + spread + 1.01 * error, best)
-    assert not _draws._no_worse(best + 1e-9, best)  # worse in every segment alike
-    assert not _draws._no_worse(np.full(4, np.inf), best)
+    assert _draws.no_worse(best, best)
+    assert _draws.no_worse(best + spread + 0.99 * error, best)
+    assert not _draws.no_worse(best + spread + 1.01 * error, best)
+    assert not _draws.no_worse(best + 1e-9, best)  # worse in every segment alike
+    assert not _draws.no_worse(np.full(4, np.inf), best)
     # One segment has no standard error.
-    assert _draws._no_worse(best[:1], best[:1])
-    assert not _draws._no_worse(best[:1] + 1e-9, best[:1])
+    assert _draws.no_worse(best[:1], best[:1])
+    assert not _draws.no_worse(best[:1] + 1e-9, best[:1])
 
 
 def test_every_amplitude_is_covered_and_its_width_is_said(made: Callable[..., Draws]) -> None:
