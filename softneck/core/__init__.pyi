@@ -38,6 +38,7 @@ from ._blas_threads import core_count as core_count
 from ._blas_threads import cores_taken as cores_taken
 from ._blas_threads import one_blas_thread as one_blas_thread
 from ._blas_threads import side_by_side as side_by_side
+from ._blas_threads import take_core_until as take_core_until
 from ._blas_threads import take_cores as take_cores
 from ._certificate import CERTIFICATE_ENDING as CERTIFICATE_ENDING
 from ._certificate import CERTIFICATE_KINDS as CERTIFICATE_KINDS

@@ -97,6 +97,17 @@ def cores_taken(count: int) -> Iterator[None]:
             _FREE_CORES.release()
 
 
+def take_core_until(ended: Callable[[], object]) -> None:
+    """Take a free core from `side_by_side`, if there is one, until `ended`, which waits for a process, returns."""
+
+    def wait_for_it() -> None:
+        ended()
+        _FREE_CORES.release()
+
+    if take_cores(1):
+        threading.Thread(target=wait_for_it, daemon=True).start()
+
+
 def side_by_side(calls: Sequence[Callable[[], _Result]]) -> list[_Result]:
     """Return the results of `calls`, which begin in their order, in this thread and in one more for each free core.
 

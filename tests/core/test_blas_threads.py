@@ -16,7 +16,7 @@ import scipy.linalg  # noqa: F401  (its BLAS is one of those that are counted)
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from softneck.core import _blas_threads
-from softneck.core._blas_threads import cores_taken, one_blas_thread, side_by_side, take_cores
+from softneck.core._blas_threads import cores_taken, one_blas_thread, side_by_side, take_core_until, take_cores
 from softneck.core._kinds import KINDS, kinds_of, make_settings, resolve
 from softneck.identification import FamilySettings
 from softneck.identification.selection._auto import choose
@@ -183,3 +183,18 @@ def test_cores_that_processes_take_are_free_again_afterwards(free: threading.Sem
             free.release(2 - count)
         raise _AskedError
     assert _count(free) == 2
+
+
+def test_a_core_is_taken_until_a_process_ends_and_no_longer(free: threading.Semaphore) -> None:
+    ends = [threading.Event() for _ in range(3)]
+    for end in ends:
+        take_core_until(end.wait)
+    assert take_cores(1) == 0
+    ends[0].set()
+    # Another thread releases it: ten seconds are far beyond any pause of the machine.
+    assert free.acquire(timeout=10.0)
+    assert take_cores(1) == 0
+    for end in ends[1:]:
+        end.set()
+    assert free.acquire(timeout=10.0)
+    assert take_cores(1) == 0, "the third had none"

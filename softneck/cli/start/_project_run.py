@@ -27,9 +27,9 @@ from softneck.core import (
     SettingsError,
     SoftneckError,
     core_count,
-    cores_taken,
     file_hash,
     settings_text,
+    take_core_until,
     write_text,
 )
 
@@ -130,10 +130,6 @@ class ProjectRun:
                 words = [*step.command[1:]]
             self.begun[step.key] = _Process.of(words, step.makes, _hashes(step))
 
-    def _running(self) -> int:
-        """Return how many processes run beside this one, each on a core of its own."""
-        return sum(process.running.poll() is None for process in self.begun.values())
-
     def _was_begun(self, step: Step) -> bool:
         """Wait for a step that has begun and tell what it said; return whether it needs no other run.
 
@@ -154,7 +150,7 @@ class ProjectRun:
         entry |= {"holds": not step.finding, "said": step.finding}
         try:
             said = io.StringIO() if self.as_json else sys.stdout
-            with _ctrl_c_ends(), contextlib.redirect_stdout(said), cores_taken(self._running()):
+            with _ctrl_c_ends(), contextlib.redirect_stdout(said):
                 if not self._was_begun(step):
                     (_pytest if words[0] == "python" else _softneck)(words, as_json=self.as_json)
         except CheckFailedError as error:
@@ -191,6 +187,7 @@ class _Process:
         running = subprocess.Popen(
             [sys.executable, "-P", *words], stdin=subprocess.DEVNULL, stdout=said[0], stderr=said[1]
         )
+        take_core_until(running.wait)
         return cls(running, makes, reads or {}, said)
 
     def finish(self, step: Step, *, as_json: bool) -> bool:
