@@ -175,9 +175,9 @@ def content_name(text: str, prefix: str = "softneck") -> str:
 
 def _link(runtime: str, content: str, prefix: str) -> str:
     """Return lines that import a member's functions from its own module; they contain the hash of its text."""
-    functions = ("state_size", "initialise", "step")
+    functions = {"state_size": "linked_size", "initialise": "initialise", "step": "step"}
     lines = [f'{prefix}linked = load_runtime("{runtime}")', f'{prefix}content = "{content}"']
-    lines += [f"{prefix}{name} = {prefix}linked.{name}" for name in functions]
+    lines += [f"{prefix}{name} = {prefix}linked.{field}" for name, field in functions.items()]
     return "\n".join(["from softneck.runtime import load_runtime", "", *lines, f"del load_runtime, {prefix}linked", ""])
 
 

@@ -45,6 +45,7 @@ class Runtime:
         step: (arrays, parameters, state, inputs, outputs) advances by one sample, in place.
         run_steps: the same over rows of inputs.
         run_horizon: predictions a number of steps ahead from every row.
+        linked_size: `state_size` for compiled functions; it is plain Python, which takes less time than to compile it.
         compiled: whether numba compiled them.
     """
 
@@ -53,6 +54,7 @@ class Runtime:
     step: Callable[..., None]
     run_steps: Callable[..., None]
     run_horizon: Callable[..., None]
+    linked_size: Callable[..., int]
     compiled: bool
 
 
@@ -85,9 +87,18 @@ def _runtime(module: str, compiled: bool) -> Runtime:
     # Members that are compiled already are linked: six models in one text would take minutes to compile.
     linked = compiled and have_numba() and "(" in module
     namespace = _import_text(bundle(module, linked=linked), compiled=compiled)
-    names = ("state_size", "initialise", "step", "run_steps", "run_horizon")
+    names = ("initialise", "step", "run_steps", "run_horizon", "state_size")
+    size = _in_python(namespace.state_size)
     done = compiled and _compile(namespace, names)
-    return Runtime(*(getattr(namespace, name) for name in names), compiled=done)
+    return Runtime(size, *(getattr(namespace, name) for name in names), compiled=done)
+
+
+def _in_python(function: FunctionType) -> FunctionType:
+    """Return a copy of a function that still calls plain Python when those of its module are compiled."""
+    names = dict(function.__globals__)
+    plain = {name: value for name, value in names.items() if isinstance(value, FunctionType)}
+    names |= {name: FunctionType(value.__code__, names, name, value.__defaults__) for name, value in plain.items()}
+    return names[function.__name__]
 
 
 @cache

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import softneck
-from softneck.core import SoftneckError, load
+from softneck.core import DataError, load
 from softneck.robot import Robot
 from softneck.runtime import cache_folder
 
@@ -22,26 +22,27 @@ from ._plan import AUTO, FAMILY, KINDS_BESIDE_DRAWS, PI, linear_model
 
 if TYPE_CHECKING:
     from softneck.identification import Family
-    from softneck.signals import Recording
 
-# Enough for a model of any kind; the names and sizes of what is compiled do not depend on them.
+# Enough for a linear model; the names and sizes of what is compiled do not depend on them.
 _ROWS = 2000
 
 
 def compile_ahead(*recordings: str) -> None:
     """Compile what the steps after the models call, in a process that no step waits for.
 
-    Run are an observer and the loops of the first controllers over a family of few rows, then loops over the best model
-    if that is nonlinear, and the predictions of the report; the steps then load the functions from the cache.
+    Run are an observer over a model of few rows, which needs nothing that the steps beside it compile, loops of the
+    first controllers over the family, then over the best model if that is nonlinear, and the predictions of the report;
+    the steps then load the functions from the cache.
     """
-    from softneck import estimation, signals
+    from softneck import estimation, identification, signals
 
     gc.set_threshold(*GARBAGE_THRESHOLDS)
     first = signals.read_recording(recordings[0])
     few = first.rows(0, _ROWS)
-    family = _family_of(few)
-    with contextlib.suppress(SoftneckError):
-        estimation.fit_observer(estimation.KalmanSettings().design(family), [few], set())
+    with contextlib.suppress(DataError):
+        model = identification.Rls().fit(few)
+        estimation.fit_observer(estimation.KalmanSettings().design(model), [few], set())
+    family = _await(FAMILY)
     if family.draws is not None:
         _judge_kinds(family, family.draws.model)
     _await(PI)  # the models are there then
@@ -50,15 +51,6 @@ def compile_ahead(*recordings: str) -> None:
     for name in dict.fromkeys((AUTO, linear_model())):
         load(name).predict(first, 2)  # any horizon but one sample
     compiled_before().touch()
-
-
-def _family_of(few: Recording) -> Family:
-    """Return a family of few rows, or that of `start` where these tell too little."""
-    with contextlib.suppress(SoftneckError):
-        family = softneck.family(few, draws=1)
-        if family.draws is not None:
-            return family
-    return _await(FAMILY)
 
 
 def _judge_kinds(family: Family, model: Any) -> None:

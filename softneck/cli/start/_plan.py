@@ -137,11 +137,13 @@ def steps(options: Options) -> Iterator[Step]:
         proposed = Path(recordings[0]).with_suffix(".robot.toml")
         yield _robot(proposed.as_posix() if proposed.is_file() else "neck")
     yield from _with_sensor(recordings, options)
-    for recording in recordings:
+    imported = list(recordings)
+    yield from _of_one_sample_time(recordings)
+    for recording in imported:
         page = f"build/quality/{Path(recording).stem}.html"
         command = ("softneck", "info", recording, "--html", page, "--force")
-        yield Step(stage="quality", command=command, makes=(page,), reads=(recording,))
-    yield from _of_one_sample_time(recordings)
+        yield Step(stage="quality", command=command, makes=(page,), reads=(recording,), beside=(_family(recordings),),
+                   compiles=tuple(recordings))  # fmt: skip
     yield from _models(recordings, options)
     yield from _controller(options)
     yield from _loops(options)
@@ -215,10 +217,7 @@ def _models(recordings: list[str], options: Options) -> Iterator[Step]:
     robot = Robot.read("robot.toml")
     if absent := lacking(robot):
         note(f"robot.toml lacks {', '.join(absent)}: add them now, or the run ends after the models")
-    # Linear checks then cover the uncertainty of the recordings, not one nominal model.
-    words = ("softneck", "family", *recordings, "-o", FAMILY, "--html", "build/family.html", "--force")
-    family = Step(stage="identification", command=words, makes=(FAMILY,), reads=tuple(recordings),
-                  unmet=Unmet.DONE_WITHOUT)  # fmt: skip
+    family = _family(recordings)
     yield Step(stage="identification", command=command, makes=(AUTO,), reads=tuple(recordings), unmet=Unmet.NO_MODEL,
                beside=(family,), compiles=tuple(recordings))  # fmt: skip
     require_known(Robot.read("robot.toml"))
@@ -230,6 +229,13 @@ def _models(recordings: list[str], options: Options) -> Iterator[Step]:
     yield Step(stage="observer", command=command, makes=(OBSERVER,), reads=(linear, *recordings),
                beside=tuple(_fmus(options)[:1]))  # fmt: skip
     yield family
+
+
+def _family(recordings: Sequence[str]) -> Step:
+    """Return the step with which linear checks cover the uncertainty of the recordings, not one nominal model."""
+    words = ("softneck", "family", *recordings, "-o", FAMILY, "--html", "build/family.html", "--force")
+    return Step(stage="identification", command=words, makes=(FAMILY,), reads=tuple(recordings),
+                unmet=Unmet.DONE_WITHOUT)  # fmt: skip
 
 
 def linear_model() -> str:

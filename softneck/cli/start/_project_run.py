@@ -90,9 +90,8 @@ class ProjectRun:
         if not kept:
             for other in step.beside:
                 self._begin(other)
-            if step.compiles and core_count() > 1 and not _compile_ahead.compiled_before().is_file():
-                code = f"from {_compile_ahead.__name__} import compile_ahead; compile_ahead{step.compiles!r}"
-                self.begun["compile ahead"] = _Process.of(["-c", code])
+            if step.compiles:
+                self._compile(step.compiles)
             begun = bool(same and entry and not entry.get("ended"))
             self.done[step.key] = {
                 "command": step.shown,
@@ -129,6 +128,13 @@ class ProjectRun:
             if step.command[0] == "python":
                 words = [*step.command[1:]]
             self.begun[step.key] = _Process.of(words, step.makes, _hashes(step))
+
+    def _compile(self, recordings: tuple[str, ...]) -> None:
+        """Compile what later steps call in a process of its own, once, if there is a core for it."""
+        known = "compile ahead" in self.begun or _compile_ahead.compiled_before().is_file()
+        if not known and core_count() > 1:
+            code = f"from {_compile_ahead.__name__} import compile_ahead; compile_ahead{recordings!r}"
+            self.begun["compile ahead"] = _Process.of(["-c", code])
 
     def _was_begun(self, step: Step) -> bool:
         """Wait for a step that has begun and tell what it said; return whether it needs no other run.

@@ -5,7 +5,9 @@ Workers are this process, local processes of loky, or a Dask cluster; all are ex
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import gc
 import signal
 import tempfile
 import threading
@@ -146,6 +148,7 @@ def _begin_worker(folder: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     tempfile.tempdir = folder
     take_cores(core_count())
+    atexit.register(gc.freeze)  # else it looks for unused objects while it ends, and the parent waits
 
 
 Row = dict[str, Any]

@@ -191,12 +191,12 @@ def test_functions_are_compiled_ahead_on_another_core_once_and_no_longer_than_th
     assert all(one.returncode for one in made), "it was ended"
 
 
-@pytest.mark.parametrize("few", ["explain", "have no draws", "are too few"])
+@pytest.mark.parametrize("enough", [True, False])
 @pytest.mark.parametrize("nonlinear", [True, False])
 def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model_if_loops_are(
-    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nonlinear: bool, few: str
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nonlinear: bool, enough: bool
 ) -> None:
-    """The family is of few rows, before that of `start` is there; where they tell too little it waits for that one."""
+    """The observer is over a model of few rows, before the family is there; where they tell too little it has none."""
     tuning = SimpleNamespace(LEVELS=("linear", "margins"))
     ran: list[tuple[Any, ...]] = []
     tuning.task_of = lambda plants, *_: plants
@@ -206,20 +206,20 @@ def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model_i
     def comes(_: float) -> None:
         asked.append(1.0)
         Path(_plan.PI).parent.mkdir(exist_ok=True)
-        Path(_plan.FAMILY if not Path(_plan.FAMILY).exists() and few != "explain" else _plan.PI).touch()
+        Path(_plan.PI if Path(_plan.FAMILY).exists() else _plan.FAMILY).touch()
 
-    def family_of(rows: str, draws: int) -> Any:
-        assert (rows, draws) == ("log.csv to 2000", 1)
-        if few == "are too few":
+    def fit(rows: str) -> str:
+        assert rows == "log.csv to 2000"
+        if not enough:
             raise DataError("record longer.")
-        return _Family() if few == "explain" else _Family(None)
+        return "rls"
 
     call("robot", "new", "robot.toml", "--preset", "neck")
     Path("models").mkdir()
     Path("models", f"auto_{'linear' if nonlinear else 'nonlinear'}.npz").touch()  # the best of the other sort
     monkeypatch.setattr(softneck, "tuning", tuning)
     monkeypatch.setattr(softneck, "estimation", _Estimation(ran))
-    monkeypatch.setattr(softneck, "family", family_of)
+    monkeypatch.setattr(softneck.identification, "Rls", lambda: SimpleNamespace(fit=fit))
     monkeypatch.setattr(_compile_ahead.time, "sleep", comes)
     monkeypatch.setattr(_compile_ahead, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(softneck.signals, "read_recording", _Rows)
@@ -234,10 +234,25 @@ def test_what_is_compiled_ahead_is_over_the_draws_and_then_over_the_best_model_i
 
     # Last what the report predicts with: the best model and the best linear one.
     report = [("log.csv", "models/auto.npz"), *([("log.csv", "models/auto_linear.npz")] if nonlinear else [])]
-    observed = ("observer", ["log.csv to 2000"], set())
-    assert ran == [observed, *judged("drawn", False), *(judged(auto, True) if nonlinear else []), *report]
-    assert len(asked) == (1 if few == "explain" else 2)
+    observed = [("observer over rls", ["log.csv to 2000"], set())] if enough else []
+    assert ran == [*observed, *judged("drawn", False), *(judged(auto, True) if nonlinear else []), *report]
+    assert len(asked) == 2, "it waits for the family, then for the controller"
     assert _compile_ahead.compiled_before().is_file()
+
+
+def test_the_observer_of_few_rows_is_fitted_with_our_own_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Errors in the process that compiles ahead are seen by nobody: here they would be."""
+    fitted: list[Any] = []
+    fit = softneck.estimation.fit_observer
+    monkeypatch.setattr(softneck.estimation, "fit_observer", lambda *asked: fitted.append(fit(*asked)))
+    monkeypatch.setattr(_compile_ahead.gc, "set_threshold", lambda *_: None)
+    monkeypatch.setattr(_compile_ahead.os, "getppid", iter(range(9)).__next__)  # the run ends at once
+    path = tmp_path / "log.csv"
+    softneck.signals.write_recording(path, neck_recording(2500))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        _compile_ahead.compile_ahead(str(path))
+    assert len(fitted) == 1
 
 
 class _Rows(str):
@@ -260,7 +275,7 @@ class _Estimation:
     ran: list[tuple[Any, ...]]
 
     def KalmanSettings(self) -> Any:
-        return SimpleNamespace(design=lambda _: "observer")
+        return SimpleNamespace(design=lambda model: f"observer over {model}")
 
     def fit_observer(self, *asked: Any) -> None:
         self.ran.append(asked)
