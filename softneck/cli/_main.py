@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import functools
 import gc
 import logging
 import os
@@ -129,8 +130,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
         # The reader of a pipe went away: no error of the user's.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except ModuleNotFoundError as error:
-        return _missing(error)
+    except ModuleNotFoundError as error:  # an extra that is not installed; any other is an internal error
+        line = missing_extra(error)
+        return _internal(error) if line is None else _fail(line, _BAD_INPUT)
     except OSError as error:
         return _fail(f"{error.filename or 'input/output'}: {error.strerror or error}", _BAD_INPUT)
     except Exception as error:  # the outermost frame: everything unforeseen is an internal error
@@ -147,36 +149,23 @@ def _without_remarks() -> Iterator[None]:
         yield
 
 
-class _Once(logging.Handler):
-    """Prints each line of the library's log once on stderr."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._said = set[str]()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        line = record.getMessage()
-        if line not in self._said:
-            self._said.add(line)
-            click.echo(line, err=True)
-
-
 @contextlib.contextmanager
 def _saying_which_robot() -> Iterator[None]:
     """Print the robot file that was found and is applied without an option naming it."""
-    log, heard = logging.getLogger("softneck.robot"), _Once()
+    said = functools.cache(functools.partial(click.echo, err=True))  # each line once
+
+    def tell(record: logging.LogRecord) -> bool:
+        said(record.getMessage())
+        return False  # there is no more to do with it
+
+    log, heard = logging.getLogger("softneck.robot"), logging.Handler()
+    heard.addFilter(tell)
     log.addHandler(heard)
     log.setLevel(logging.INFO)
     try:
         yield
     finally:
         log.removeHandler(heard)
-
-
-def _missing(error: ModuleNotFoundError) -> int:
-    """Name the extra of a missing package; any other missing module is an internal error."""
-    line = missing_extra(error)
-    return _internal(error) if line is None else _fail(line, _BAD_INPUT)
 
 
 def _internal(error: Exception) -> int:

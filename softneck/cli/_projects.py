@@ -13,7 +13,7 @@ import click
 from softneck import plots
 from softneck.core import CheckFailedError, OutputFileError, refuse_existing, write_text
 
-from .shared._console import Stages, note, print_json, print_table, progress
+from .shared._console import note, print_json, print_table, progress, stages
 from .shared._options import common_options, target
 
 if TYPE_CHECKING:
@@ -138,8 +138,8 @@ def demo(output: Path | None, quick: bool, force: bool, as_json: bool) -> None:
     settings = DemoSettings.quick(folder) if quick else DemoSettings(out=folder)
     if quick and not as_json:
         note(f"quick: the Eq. 22 experiment is {settings.duration:g} s long, not the paper's 200 s, and trained less")
-    with Stages(quiet=as_json) as stages:
-        found = run_demo(settings, tell=stages.begin)
+    with stages(quiet=as_json) as begin:
+        found = run_demo(settings, tell=begin)
     if as_json:
         print_json(found.as_dict() | {"seconds": found.seconds})
     else:
@@ -196,10 +196,10 @@ def paper(html: Path | None, seed: int, necks: int, force: bool, as_json: bool) 
 
     if html is not None:
         refuse_existing(html, force=force)
-    with Stages(quiet=as_json) as stages:
-        found = reproduce(ReproduceSettings(seed=seed, other_necks=necks), tell=stages.begin)
+    with stages(quiet=as_json) as begin:
+        found = reproduce(ReproduceSettings(seed=seed, other_necks=necks), tell=begin)
         if html is not None:
-            stages.begin("draw the figures")
+            begin("draw the figures")
             plots.write_page(html, paper_page(found), force=force)
     rows = paper_entries(found)
     if as_json:

@@ -6,8 +6,7 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import click
@@ -71,32 +70,19 @@ def progress(what: str, *, quiet: bool = False) -> Iterator[ProgressCallback]:
         yield lambda done, word: bar.update(task, completed=done, description=f"{what}: {word}")
 
 
-class Stages:
-    """Announces stages; each ends when the next begins."""
+@contextlib.contextmanager
+def stages(*, quiet: bool) -> Iterator[Callable[[str], Progress]]:
+    """Yield a function that starts a stage; each ends when the next begins, and its time is printed."""
+    with contextlib.ExitStack() as stack:
 
-    def __init__(self, *, quiet: bool) -> None:
-        self._quiet = quiet
-        self._stack = ExitStack()
-        self._name = ""
-        self._since = 0.0
+        def begin(name: str) -> Progress:
+            stack.close()
+            since = time.monotonic()
+            if not quiet:
+                stack.callback(lambda: note(f"{name}: {time.monotonic() - since:.1f} s"))
+            return stack.enter_context(progress(name, quiet=quiet))
 
-    def __enter__(self) -> Stages:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end()
-
-    def begin(self, name: str) -> Progress:
-        """End the stage before and start the next."""
-        self._end()
-        self._name, self._since = name, time.monotonic()
-        return self._stack.enter_context(progress(name, quiet=self._quiet))
-
-    def _end(self) -> None:
-        self._stack.close()
-        if self._name and not self._quiet:
-            note(f"{self._name}: {time.monotonic() - self._since:.1f} s")
-        self._name = ""
+        yield begin
 
 
 # [%] The fit of the constant mean; a model below it is useless.

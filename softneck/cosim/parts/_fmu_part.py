@@ -268,7 +268,6 @@ def drive_fmu(
     parameters: Mapping[str, float] | None = None,
     outputs: tuple[str, ...] | None = None,
     start_time: float = 0.0,
-    report: Callable[[float], None] | None = None,
 ) -> Matrix:
     """Step an FMU through rows of inputs, name -> (rows,), and return its outputs (rows, n_out); row k is at t_k.
 
@@ -282,7 +281,6 @@ def drive_fmu(
         if name not in known:
             raise DataError(f"`{name}` is not an output of {path}; it has {', '.join(known)}.")
     chosen = [known.index(name) for name in (known if outputs is None else outputs)]
-    stride = max(1, len(rows) // 100)
     table = np.empty((len(rows), len(part.outputs)))
     plant = part.role == "plant"
     with part:
@@ -291,8 +289,6 @@ def drive_fmu(
             after = part.advance(start_time + k * part.sample_time, row) if k + 1 < len(rows) or not plant else now
             table[k] = now if plant else after
             now = after
-            if report is not None and (k + 1) % stride == 0:
-                report((k + 1) / len(rows))
     return table[:, chosen]
 
 
@@ -302,7 +298,6 @@ def simulate_fmu(
     *,
     parameters: Mapping[str, float] | None = None,
     outputs: tuple[str, ...] | None = None,
-    report: Callable[[float], None] | None = None,
 ) -> Matrix:
     """Simulate a plant FMU (free run) with a recording's set-points; return its outputs (time, n_out).
 
@@ -313,7 +308,6 @@ def simulate_fmu(
         recording: with the set-points.
         parameters: values by name, such as `pitch_start` [rad].
         outputs: names; default: all.
-        report: called regularly with the done fraction.
 
     Raises:
         DataError: another sample time than the FMU's, or unknown names.
@@ -328,9 +322,7 @@ def simulate_fmu(
     tables = []
     for run in recording.runs():
         drive = dict(zip(run.robot.set_points, run.set_points.T, strict=True))
-        tables.append(
-            drive_fmu(path, drive, parameters=parameters, outputs=outputs, start_time=float(run.time[0]), report=report)
-        )
+        tables.append(drive_fmu(path, drive, parameters=parameters, outputs=outputs, start_time=float(run.time[0])))
     return np.concatenate(tables)
 
 
