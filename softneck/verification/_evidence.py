@@ -51,12 +51,10 @@ class Values:
 class LinearEvidence:
     """Results of the linear methods for one linear form.
 
-    `name`: of the frozen point, "" for a linear controller. `law`: the form. `plants`: with the delay that the order
-    adds: those of the boxes, then the worst of the search. `margins`: name -> (n,). `found`: result of the search; None
-    if switched off. `structured`: bounds of each source.
+    `law`: the form. `plants`: with the delay that the order adds: those of the boxes, then the worst of the search.
+    `margins`: name -> (n,). `found`: result of the search; None if switched off. `structured`: bounds of each source.
     """
 
-    name: str
     law: LinearLaw
     plants: Plants
     margins: dict[str, Vector]
@@ -71,7 +69,7 @@ class Evidence(ReprMixin):
     Attributes:
         plants: of the boxes, with the delay that the order adds.
         frequency: (m,) [rad/s].
-        linear: one for each linear form.
+        linear: of the controller's linear form; none without one.
         steps: of `stepped`: all plants and the worst of the searches.
         necks: simulated loops.
         metrics: name -> values.
@@ -156,10 +154,8 @@ def _linear_evidence(
     base = all_plants(sources, int(asked.sampling["plants"]), seed)
     plants = base.later(controller.extra)
     w = frequency_grid(base.sample_time, asked.scale.time)
-    linear = []
-    for number, (name, law) in enumerate(controller.laws.items()):
-        progress(0.4 * number / len(controller.laws), "margins" + (f" at {name}" if name else ""))
-        linear.append(_linear(name, law, plants, sources, controller.extra, asked))
+    progress(0.0, "margins")
+    linear = [_linear(law, plants, sources, controller.extra, asked) for law in controller.laws.values()]
     progress(0.4, "steps against every plant")
     stepped = join([plants, *(part.plants.take(np.arange(len(plants), len(part.plants))) for part in linear)])
     test, weights = asked.step_test(seed), sources[0].weights
@@ -186,14 +182,14 @@ def _simulated(
 
 
 def _linear(
-    name: str, law: LinearLaw, plants: Plants, necks: list[PlantSource], extra: int, asked: Requirements
+    law: LinearLaw, plants: Plants, necks: list[PlantSource], extra: int, asked: Requirements
 ) -> LinearEvidence:
     seed, generations = int(asked.sampling["seed"]), int(asked.sampling["search_generations"])
     found = search(necks, law, extra=extra, generations=generations, seed=seed) if generations else None
     tried = plants if found is None else join([plants, found.plants.later(extra)])
     table = margins(tried, law)
     parts = [structured_singular_value(neck, law, extra=extra, scale=asked.scale) for neck in necks]
-    return LinearEvidence(name, law, tried, table, found, parts)
+    return LinearEvidence(law, tried, table, found, parts)
 
 
 def _add_data_margins(evidence: Evidence) -> None:
@@ -253,9 +249,6 @@ def _fill_metrics(evidence: Evidence, controller: ControllerUnderTest, asked: Re
         absent["steps of other payloads"] = NO_PAYLOAD_IN_STEPS
     if not asked.sampling["search_generations"]:
         absent["stability.searched_radius"] = "the search is switched off (search_generations = 0)"
-    if any(part.name for part in evidence.linear):
-        why = "linear checks hold at frozen points; motion between them is simulated"
-        absent["stability between frozen points"] = why
     _add_data_margins(evidence)
     for name, values in evidence.steps.metrics.items():
         metrics[f"step.{asked.scale.name_of(name)}"] = Values(values, _step_describer(evidence, name))
@@ -286,7 +279,7 @@ def _asks_slack(asked: Requirements) -> bool:
 
 def _add_linear_margins(evidence: Evidence, part: LinearEvidence) -> None:
     count = len(evidence.plants)
-    describe = _plant_describer(part)
+    describe: Describe = lambda row: {**plant_facts(part.plants, row), "axis": "both"}  # noqa: E731
     table = dict(part.margins)
     radius = table.pop("stability.radius")
     _add(evidence, "stability.radius", Values(radius[:count], describe))
@@ -303,7 +296,7 @@ def _add_linear_margins(evidence: Evidence, part: LinearEvidence) -> None:
         for found in (f"{axis}.{name}" for axis in axes):
             _add(evidence, f"axes.{name}", Values(part.margins[found], _with_axis(describe, found, axes)))
     for row in (row for rows in part.structured for row in rows):
-        _add(evidence, "robust.mu", Values(np.array([row.mu]), _structured_describer(row, part.name)))
+        _add(evidence, "robust.mu", Values(np.array([row.mu]), _structured_describer(row)))
 
 
 def _add(evidence: Evidence, name: str, more: Values) -> None:
@@ -338,15 +331,10 @@ def plant_facts(plants: Plants, row: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _plant_describer(part: LinearEvidence) -> Describe:
-    point = {"frozen_point": part.name} if part.name else {}
-    return lambda row: {**plant_facts(part.plants, row), "axis": "both", **point}
-
-
-def _structured_describer(row: StructuredResult, point: str) -> Describe:
+def _structured_describer(row: StructuredResult) -> Describe:
     at = float(row.frequency[int(np.argmax(row.upper))])
     facts = {"kind": "box", "name": "the whole box", "axis": row.axes, "frequency_rad_s": at}
-    return lambda _: {**facts, "frozen_point": point} if point else facts
+    return lambda _: facts
 
 
 def _step_describer(evidence: Evidence, name: str) -> Describe:

@@ -212,11 +212,10 @@ def _scalars(M: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ControllerUnderTest:
-    """A controller with its linear forms.
+    """A controller with its linear form.
 
-    `block`: its runtime. `robot`: of the controller. `laws`: name -> linear form: "" for a linear controller, else one
-    for each frozen point. `order`: of the loop. `extra`: samples that the order adds to the plant's delay. `why`: why
-    there is no linear form, or "".
+    `block`: its runtime. `robot`: of the controller. `laws`: the linear form under the name "", or none. `order`: of
+    the loop. `extra`: samples that the order adds to the plant's delay. `why`: why there is no linear form, or "".
     """
 
     block: Block
@@ -228,11 +227,10 @@ class ControllerUnderTest:
 
 
 def controller_under_test(controller: Any, *, order: str | None, observer: bool) -> ControllerUnderTest:
-    """Return a controller with its linear forms; `order` None is that of its design.
+    """Return a controller with its linear form; `order` None is that of its design.
 
-    A linear controller has `ss()` or `to_lti()`, from references and outputs to the redefined inputs. One that is
-    linear at each operating point has `ss_at(point)` and `points()`, name -> point. Raises SettingsError: no
-    controller, or a linear form with other channels.
+    A linear controller has `ss()` or `to_lti()`, from references and outputs to the redefined inputs. Raises
+    SettingsError: no controller, or a linear form with other channels.
     """
     if not hasattr(controller, "block"):
         raise SettingsError(f"a controller is needed, one with `block()`; got {type(controller).__name__}.")
@@ -254,17 +252,10 @@ def controller_under_test(controller: Any, *, order: str | None, observer: bool)
 
 
 def _laws(controller: Any) -> tuple[dict[str, LinearLaw], str]:
-    robot = robot_of(controller)
     for name in ("ss", "to_lti"):
         if hasattr(controller, name):
-            return {"": LinearLaw.of(getattr(controller, name)(), robot)}, ""
-    if hasattr(controller, "ss_at") and hasattr(controller, "points"):
-        points = controller.points()
-        return {name: LinearLaw.of(controller.ss_at(point), robot) for name, point in points.items()}, ""
-    return (
-        {},
-        f"the controller {controller.block().kind} has no linear form (`ss()`, or `ss_at(point)` with `points()`)",
-    )
+            return {"": LinearLaw.of(getattr(controller, name)(), robot_of(controller))}, ""
+    return {}, f"the controller {controller.block().kind} has no linear form (`ss()`)"
 
 
 _POINT_COUNT, _POINTS_ABOVE = 2000, 400

@@ -202,9 +202,7 @@ def _worst_plant(verdict: Verdict, axes: tuple[str, ...]) -> str:
     if verdict.note:
         return verdict.note.removeprefix("not computed: ")
     worst = verdict.worst
-    where = f", {worst['axis']}" if worst.get("axis") in axes else ""
-    point = f" (frozen at {worst['frozen_point']})" if worst.get("frozen_point") else ""
-    return f"{worst.get('name', '')}{where}{point}"
+    return str(worst.get("name", "")) + (f", {worst['axis']}" if worst.get("axis") in axes else "")
 
 
 def verification_page(found: Verification, controller: str, certificate: str = "") -> str:
@@ -255,7 +253,6 @@ def _requirements_section(found: Verification, certificate: str, stepped: Chart)
 
 
 def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]:
-    title = f" at {part.name}" if part.name else ""
     mu = [
         [neck.name, row.axes, f"{row.mu:.3f}"]
         for neck, rows in zip(found.necks, part.structured, strict=True) for row in rows
@@ -263,10 +260,8 @@ def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]
     bounds = Table("Bounds", ["plants", "axis", "mu, bound"], mu, text=2)
     charts = frequency_charts(part, found.evidence.frequency, found.necks[0].gain_unit)
     return [
-        Section(
-            f"Frequency responses{title}", tables=[_margin_table(part, drawn=bool(found.evidence.drawn))], charts=charts
-        ),
-        Section(f"Structured singular value{title}", tables=[bounds], charts=mu_charts(part)),
+        Section("Frequency responses", tables=[_margin_table(part, drawn=bool(found.evidence.drawn))], charts=charts),
+        Section("Structured singular value", tables=[bounds], charts=mu_charts(part)),
     ]
 
 

@@ -130,7 +130,7 @@ def test_every_linear_plant_law_and_axis_counts(name: str, monkeypatch: pytest.M
     ready: Any = SimpleNamespace(plants=plants, frequency=None, weights=None)
 
     def judged(values: Any, laws: int) -> dict[str, float]:
-        """Return the metrics where the values are spread over so many frozen points."""
+        """Return the metrics where the values are spread over so many linear forms."""
         parts = iter(np.array_split(np.array(values), laws))
         one = SimpleNamespace(laws={str(k): k for k in range(laws)}, extra=0, block=None)
         monkeypatch.setattr(_judge, "controller_under_test", lambda *_, **__: one)

@@ -465,7 +465,7 @@ def test_margins_of_each_law_plant_and_search_stand_under_their_axis_and_under_a
     # Of two sources, the second of which has two boxes.
     boxes = [StructuredResult("pitch", np.array([1.0, 2.0]), np.array(upper)) for upper in ([0.3, 0.6], [0.9, 0.2])]
     rows = [boxes[:1], boxes]
-    part: Any = SimpleNamespace(name="low", plants=plants, margins=margin_table, structured=rows,
+    part: Any = SimpleNamespace(plants=plants, margins=margin_table, structured=rows,
                                 found=SimpleNamespace(radius=0.99))  # fmt: skip
     evidence: Any = SimpleNamespace(metrics={}, plants=[0, 1])
     with pytest.MonkeyPatch.context() as patch:
@@ -478,18 +478,16 @@ def test_margins_of_each_law_plant_and_search_stand_under_their_axis_and_under_a
         assert searched.values.tolist() == [0.95, 0.99]
         assert [searched.describe(k)["row"] for k in (0, 1)] == [2, 2]
         assert found["axes.gain_margin"].values.tolist() == [3.0, 2.5, 2.0, 4.0, 1.5, 5.0]
-        assert found["axes.gain_margin"].describe(4) == {"row": 1, "axis": "roll", "frozen_point": "low"}
-        assert found["mimo.disk_margin"].describe(1) == {"row": 1, "axis": "both", "frozen_point": "low"}
+        assert found["axes.gain_margin"].describe(4) == {"row": 1, "axis": "roll"}
+        assert found["mimo.disk_margin"].describe(1) == {"row": 1, "axis": "both"}
         assert found["robust.mu"].describe(0)["frequency_rad_s"] == 2.0
         assert found["robust.mu"].describe(2)["frequency_rad_s"] == 1.0
         assert found["robust.mu"].values.tolist() == [0.6, 0.6, 0.9]
 
 
 def test_what_was_not_computed_is_said() -> None:
-    def absent(
-        *, laws: int = 1, observer: bool = False, generations: int = 5, payload: bool = False, name: str = ""
-    ) -> Any:
-        parts: list[Any] = [SimpleNamespace(name=name) for _ in range(laws)]
+    def absent(*, laws: int = 1, observer: bool = False, generations: int = 5, payload: bool = False) -> Any:
+        parts: list[Any] = [SimpleNamespace() for _ in range(laws)]
         evidence = Evidence(None, None, parts, SimpleNamespace(metrics={}), None, [])  # pyright: ignore[reportArgumentType]
         ports = (SimpleNamespace(name="payload"),) if payload else ()
         controller: Any = SimpleNamespace(why="it has no ss()", block=SimpleNamespace(inputs=ports))
@@ -504,13 +502,11 @@ def test_what_was_not_computed_is_said() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_evidence, "_add_linear_margins", lambda _, part: added.append(part))
         assert absent() == {}
-        assert absent(laws=3) == {}
         assert absent(laws=0) == dict.fromkeys(("stability", "axes", "mimo", "robust"), "it has no ss()")
         assert set(absent(observer=True)) == {"observer in the linear checks"}
         assert set(absent(observer=True, laws=0)) == {"stability", "axes", "mimo", "robust"}
         assert set(absent(generations=0)) == {"stability.searched_radius"}
         assert set(absent(payload=True)) == {"steps of other payloads"}
-        assert set(absent(name="low")) == {"stability between frozen points"}
 
 
 @pytest.mark.parametrize("own", [True, False])
@@ -624,16 +620,12 @@ def test_the_delay_that_an_order_adds_is_the_design_s_or_a_sample_for_each_part(
     assert "own has no linear form" in found.why
 
 
-def test_a_controller_is_linear_by_its_form_or_at_its_points() -> None:
+def test_a_controller_is_linear_by_its_form() -> None:
     form = CONTROLLER().ss()
     for name in ("ss", "to_lti"):
         assert list(_linear._laws(_controller(**{name: lambda: form}))[0]) == [""]
-    points = {"low": 0.0, "high": 1.0}
-    both = _controller(ss_at=lambda point: form if point in (0.0, 1.0) else None, points=lambda: points)
-    assert list(_linear._laws(both)[0]) == ["low", "high"]
-    for half in (_controller(ss_at=lambda _: form), _controller(points=lambda: points)):
-        laws, why = _linear._laws(half)
-        assert (laws, "no linear form" in why) == ({}, True)
+    laws, why = _linear._laws(_controller())
+    assert (laws, "no linear form" in why) == ({}, True)
     for wrong in (SimpleNamespace(), SimpleNamespace(block=lambda: SimpleNamespace(role="plant", kind="p"))):
         with pytest.raises(SettingsError, match="a controller is needed"):
             _linear.controller_under_test(wrong, order=None, observer=False)

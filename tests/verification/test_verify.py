@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
@@ -177,17 +176,6 @@ class _Nonlinear:
         return self._inner.block()
 
 
-class _Frozen(_Nonlinear):
-    """A controller with a linear form at each of two points."""
-
-    def points(self) -> Mapping[str, float]:
-        return {"upright": 0.0, "bent": 0.5}
-
-    def ss_at(self, point: float) -> Any:
-        del point
-        return self._inner.ss()
-
-
 @pytest.mark.slow
 def test_what_cannot_be_computed_is_said_and_not_passed_off() -> None:
     found = verify(_Nonlinear(pi()), linear_neck(), make_requirements(QUICK))
@@ -204,16 +192,6 @@ def test_what_cannot_be_computed_is_said_and_not_passed_off() -> None:
     asked = make_requirements({**QUICK, "require": {"axes.sensitivity": {"max": 2.0}}})
     strict = verify(_Nonlinear(pi()), linear_neck(), asked)
     assert {v.requirement.metric for v in strict.failed} >= absent
-
-
-@pytest.mark.slow
-def test_frozen_points_are_each_judged() -> None:
-    found = verify(_Frozen(pi()), linear_neck(), make_requirements(QUICK))
-    plain = verify(pi(), linear_neck(), make_requirements(QUICK))
-    assert [part.name for part in found.evidence.linear] == ["upright", "bent"]
-    assert "stability between frozen points" in found.evidence.not_computed
-    for one, two in zip(found.verdicts, plain.verdicts, strict=True):
-        assert one.value == pytest.approx(two.value, rel=1e-9)
 
 
 @pytest.mark.slow
