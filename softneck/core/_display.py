@@ -10,7 +10,6 @@ import textwrap
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from datetime import timedelta
 from typing import Any
 
 import numpy as np
@@ -106,26 +105,12 @@ def shown_progress(what: str, given: Progress | None) -> Iterator[Progress]:
 
 def bar_columns() -> tuple[Any, ...]:
     """Return the columns of a bar: what is done, how much of it, the time so far and the time left."""
-    from rich.progress import BarColumn, ProgressColumn, TextColumn, TimeElapsedColumn
-    from rich.text import Text
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    class TimeLeft(ProgressColumn):
-        def render(self, task: Any) -> Text:
-            return Text(time_left(task.completed, task.elapsed or 0.0))
-
+    # The time left is by the speed of the last 30 s; what is done before the first part, as compiling, does not count.
+    left = TimeRemainingColumn(), TextColumn("left")
     # No markup: a word may name a file, and `run[1].csv` is one.
-    return TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn(), TimeLeft()
-
-
-# The time left is said from this part done on: before it a start-up counts as much as the work.
-_LEAST_DONE = 0.05
-
-
-def time_left(done: float, elapsed: float) -> str:
-    """Return the time left [h:mm:ss] if the rest goes as quickly as the part `done` in `elapsed` s; "" too early."""
-    if not _LEAST_DONE <= done < 1.0 or elapsed < _DELAY_S:
-        return ""
-    return f"{timedelta(seconds=round(elapsed * (1.0 - done) / done))} left"
+    return TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn(), *left
 
 
 def _bar() -> Any:

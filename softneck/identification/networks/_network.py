@@ -38,6 +38,8 @@ from ._nn_training import FUNCTIONS, AxisData, Best, axis_data, random_layers, t
 
 # Weight decays of the starts, from hardly any to strong smoothing; the hold-out decides between them.
 _START_DECAYS = (0.03, 0.1, 0.01)
+# Time of a step over simulation windows, in steps of one sample ahead.
+_WINDOW_COST = 1.5
 _HOLD_OUT_SHARE = 0.2
 # Neurons of the paper. Of a robot whose time constant is learned, each weight needs 4 rows.
 _PAPER_HIDDEN, _MIN_NEURONS, _ROWS_PER_WEIGHT = (25, 25), 4, 4
@@ -214,11 +216,12 @@ class Network:
         self, problem: _Problem, axis: int, reports: list[tuple[float, str]], stop: threading.Event
     ) -> dict:
         name = problem.train.robot.outputs.names[axis]
-        expected = self.iterations * (1.0 + self.starts / 3.0) + self.refine
+        expected = self.iterations * (1.0 + self.starts / 3.0) + _WINDOW_COST * self.refine
 
         def report(text: str) -> None:
             # Early stops skip steps, so the part done may jump at the end.
-            reports[axis] = (min(reports[axis][0] + 1.0 / (expected + self.starts + 4), 0.99), f"{name}: {text}")
+            cost = _WINDOW_COST if text.startswith("windows") else 1.0
+            reports[axis] = (min(reports[axis][0] + cost / (expected + self.starts + 4), 0.99), f"{name}: {text}")
 
         data, inputs, output = problem.training(axis)
         best = Best(problem.prepare(problem.judge, axis, (inputs, output))[0], report, stop.is_set)

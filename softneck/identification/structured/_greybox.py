@@ -87,7 +87,7 @@ class GreyBox:
         require_tendons(recording.robot, "kind `greybox`")
         scaled = ScaledData.of(recording, amplitudes=False)  # the equations are in rad
         problem = FitProblem.of(scaled)
-        tell = SearchProgress(progress, 3 * self.evaluations * (len(problem.numbers) + 1))
+        tell = SearchProgress(progress, 4 * self.evaluations * (len(problem.numbers) + 1))
         found = Found(problem, np.zeros(0), self.sensor_delay or 0, np.inf)
         said: dict[str, object] = {}
         try:
