@@ -41,6 +41,7 @@ from .models._linear_systems import KINDS as KINDS
 from .models._linear_systems import continuous_parameters as continuous_parameters
 from .models._linear_systems import redefined_input as redefined_input
 from .models._linear_systems import remove_unreachable_states as remove_unreachable_states
+from .models._linear_systems import to_state_space as to_state_space
 from .models._linear_systems import weights_of as weights_of
 from .models._model import embed_model as embed_model
 from .models._model import embedded_model as embedded_model

@@ -12,7 +12,7 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, Vector, require_one_of
 from softneck.design import LoopMargins, grid_response, margins_of_loops, two_scalars
 from softneck.estimation import robot_of
-from softneck.identification import AxisMeasured, response_of
+from softneck.identification import AxisMeasured, response_of, to_state_space
 from softneck.loop import ORDERS
 from softneck.robot import Robot
 from softneck.runtime import Block
@@ -61,7 +61,7 @@ class LinearLaw:
                 f"the controller goes from {', '.join(given[0])} to {', '.join(given[1])}; softneck verifies one from "
                 f"{', '.join(wanted[0])} to {', '.join(wanted[1])}."
             )
-        form: Any = control.ss(system)
+        form = to_state_space(system)
         if form.dt in (0, None) or isinstance(form.dt, bool):
             raise SettingsError("the controller's linear form must be discrete, with its sample time as dt.")
         A, B, C, D = (np.asarray(item, dtype=np.float64) for item in (form.A, form.B, form.C, form.D))

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError
+from softneck.identification import to_state_space
 from softneck.robot import Robot
 
 from ..plants._coupled import AnyAxes, coupled_plant
@@ -102,11 +103,10 @@ class CustomSettings(AxisSettings):
         return {key: value for key, value in stored.items() if key != "controller"}
 
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:
-        import control
 
         K = self.controller[name] if isinstance(self.controller, Mapping) else self.controller
         _require_sample_time(K, axis.sample_time)
-        made = error_feedback(control.ss(K)) if K.ninputs == 1 else _two_input_axis(K, name)
+        made = error_feedback(to_state_space(K)) if K.ninputs == 1 else _two_input_axis(K, name)
         return AxisDesign(made, {}, {"imported": True, **_remark_slow_loop(made, axis)})
 
 
@@ -147,14 +147,13 @@ def _require_system(K: Any, outputs: int) -> None:
         raise SettingsError(
             f"`controller` must be discrete, its dt is {K.dt}; use control.sample_system(K, 0.02, 'tustin')."
         )
-    system: Any = control.ss(K)
+    system = to_state_space(K)
     if not all(np.isfinite(np.asarray(part)).all() for part in (system.A, system.B, system.C, system.D)):
         raise DataError("`controller` has entries that are not finite.")
 
 
 def _two_input_axis(K: Any, name: str) -> AxisController:
     """Return the axis of a system from reference and angle, found by name where it has names."""
-    import control
 
     labels = list(K.input_labels)
     wanted = [f"{name}_reference", name]
@@ -171,7 +170,7 @@ def _two_input_axis(K: Any, name: str) -> AxisController:
     known = _INPUTS.get(name, f"{name}_input")
     if not output.startswith("y[") and output not in (known, f"{name}_input"):
         raise SettingsError(f"the output of the controller of {name} is {output}; it must be {known}.")
-    system: Any = control.ss(K)
+    system = to_state_space(K)
     A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (system.A, system.B, system.C, system.D))
     Br, By = B[:, order[:1]], B[:, order[1:]]
     Dr, Dy = float(D[0, order[0]]), float(D[0, order[1]])
@@ -180,11 +179,10 @@ def _two_input_axis(K: Any, name: str) -> AxisController:
 
 def _law(K: Any, names: Sequence[str]) -> tuple[Matrix, ...]:
     """Return A, Br, By, C, Dr, Dy and the conditioning L of a system of all outputs."""
-    import control
 
     m, labels = len(names), list(K.input_labels)
     wanted = [*(f"{name}_reference" for name in names), *names]
-    system: Any = control.ss(K)
+    system = to_state_space(K)
     A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (system.A, system.B, system.C, system.D))
     if K.ninputs == m:
         Br, By, Dr, Dy = B, -B, D, -D

@@ -11,6 +11,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AXES, AxisPlant
+from softneck.identification import to_state_space
 from softneck.robot import TIME_CONSTANT, Directions, Motors, Outputs, Robot
 
 from ._uncertain import UncertainAxis
@@ -258,7 +259,7 @@ def coupled_plant(source: Any, *, robot: Robot | None = None) -> CoupledPlant | 
     import control
 
     if isinstance(source, control.StateSpace | control.TransferFunction):
-        system: Any = control.ss(source)
+        system = to_state_space(source)
         neck = _is_neck(system) if robot is None else robot.input_names == _NECK_INPUTS
         if neck and (system.ninputs == 1 or not _is_coupled(system)):
             return None

@@ -20,7 +20,7 @@ from softneck.core import (
     require_positive,
 )
 from softneck.estimation import AXES, AxisPlant, LinearNeck, axis_plant, directions_of, robot_of
-from softneck.identification import Draws
+from softneck.identification import Draws, remove_unreachable_states, to_state_space
 from softneck.robot import TIME_CONSTANT, Robot
 from softneck.signals import require_same_robot
 
@@ -383,11 +383,12 @@ def _axis_from_system(system: Any, axis: str, what: str) -> AxisPlant:
 
 
 def _polynomials(system: Any) -> control.TransferFunction:
-    """Return the transfer function of a state space, without the rounding errors of its dead time."""
+    """Return the transfer function of a state space, without the other axis and rounding errors of its dead time."""
     import control
+    from scipy.signal import ss2tf
 
-    found: Any = control.ss2tf(system)
-    num, den = (np.asarray(part[0][0]) for part in (found.num, found.den))
+    found: Any = ss2tf(*remove_unreachable_states(system.A, system.B, system.C), system.D)
+    num, den = found[0][0], found[1]
     for part in (num, den):
         part[np.abs(part) < _COEFFICIENT_TOLERANCE * np.abs(part).max(initial=0.0)] = 0.0
     return control.TransferFunction(num, den, system.dt)
@@ -465,21 +466,13 @@ def _is_continuous(plant: Any) -> bool:
 
 
 def _discretize(plant: Any, period: float) -> Any:
-    import control
-
     if isinstance(plant, Mapping):
         return {name: _discretize(item, period) for name, item in plant.items()}
     if isinstance(plant, Sequence):
         return [_discretize(item, period) for item in plant]
     if not _is_continuous(plant):
         return plant
-    try:
-        system: Any = control.ss(plant)
-    except (ValueError, control.ControlMIMONotImplemented) as error:
-        raise SettingsError(
-            "the continuous plant has no state space: each of its transfer functions must be proper, and several "
-            "outputs need a control.StateSpace."
-        ) from error
+    system = to_state_space(plant)
     if not all(np.isfinite(part).all() for part in (system.A, system.B, system.C, system.D)):
         raise SettingsError("the plant has entries that are not finite.")
     return system.sample(period, method="zoh")

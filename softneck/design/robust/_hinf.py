@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_between, require_positive
+from softneck.identification import to_state_space
 
 from ..linear._axis_loop import error_feedback
 from ..linear._settings import AxisDesign, AxisSettings
@@ -377,9 +378,7 @@ class HinfSettings(AxisSettings):
         require_between("control_weight", self.control_weight, 1e-3, 100.0)
 
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
-        import control
-
-        G: Any = control.ss(axis.nominal.tf(extra_delay=self.extra_delay) / axis.nominal.static_gain)
+        G = to_state_space(axis.nominal.tf(extra_delay=self.extra_delay) / axis.nominal.static_gain)
         if self.bandwidth is not None:
             return self._design_at(axis, G, self.bandwidth)
         lag = axis.nominal.time_constant + axis.nominal.delay * axis.sample_time

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import SettingsError, Vector, require_positive
+from softneck.identification import to_state_space
 
 if TYPE_CHECKING:
     import control
@@ -110,16 +111,18 @@ def _entries(weight: Any) -> list[tuple[Any, Any]]:
 
 def _discretize(above: np.ndarray, below: np.ndarray, dt: float) -> control.TransferFunction:
     import control
+    from scipy.signal import ss2tf
 
-    made: Any = control.ss2tf(to_discrete(control.TransferFunction(above, below), dt))
-    return control.TransferFunction(made.num, made.den, dt)
+    made: Any = to_discrete(control.TransferFunction(above, below), dt)
+    num, den = ss2tf(made.A, made.B, made.C, made.D)
+    return control.TransferFunction(num[0], den, dt)
 
 
 def to_continuous(system: Any) -> control.StateSpace:
     """Return the continuous image of a discrete system; a continuous one as it is."""
     import control
 
-    discrete: Any = control.ss(system)
+    discrete = to_state_space(system)
     if discrete.dt == 0:
         return discrete
     T = float(discrete.dt)
@@ -139,7 +142,7 @@ def to_discrete(system: Any, sample_time: float) -> control.StateSpace:
     """Return the discrete system of which `system` is the image."""
     import control
 
-    continuous: Any = control.ss(system)
+    continuous = to_state_space(system)
     T = sample_time
     A, B, C, D = (np.asarray(p, dtype=np.float64) for p in (continuous.A, continuous.B, continuous.C, continuous.D))
     n = A.shape[0]

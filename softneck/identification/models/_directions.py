@@ -28,6 +28,8 @@ _TIME_CONSTANT_COUNT = 40
 _MAX_DEAD_TIME, _MAX_DEAD_TIME_STEPS = 1.5, 20
 # Relative singular value below which motions count as dependent; least squares then takes the smallest weights.
 _RANK_TOLERANCE = 1e-6
+# After so many time constants what was at the start is below rounding.
+_DECAYED = 37.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,16 +135,17 @@ def _fit_low_pass(inputs: Sequence[Matrix], outputs: Sequence[Vector]) -> tuple[
     from scipy.optimize import minimize_scalar
 
     longest = max(len(U) for U in inputs)
-    y = np.concatenate(outputs)
-    there = np.isfinite(y)
     scale = np.concatenate(inputs).std(axis=0)
     scale = np.where(scale > 0.0, scale, np.inf)  # a motor that never moves gets no weight
+    y = np.concatenate(outputs)
+    mean = y[np.isfinite(y)].sum() / y.size  # nearly so; without it less is lost to rounding
+    runs = [((U / scale).T.copy(), run - mean) for U, run in zip(inputs, outputs, strict=True)]
 
     def fit(tau: float, late: int) -> tuple[float, Vector]:
-        pole = np.exp(-1.0 / tau)
-        X = np.vstack([_low_pass_columns(U / scale, pole, late, i, len(inputs)) for i, U in enumerate(inputs)])[there]
-        theta = np.linalg.lstsq(X, y[there], rcond=_RANK_TOLERANCE)[0]
-        return float(np.sum((y[there] - X @ theta) ** 2)), theta[: inputs[0].shape[1]] / scale
+        # Normal equations: the rows of a long recording are read once for each filter, and none is copied.
+        products: Any = sum(_low_pass_products(U, run, tau, late) for U, run in runs)
+        theta = np.linalg.lstsq(products[:-1, :-1], products[:-1, -1], rcond=_RANK_TOLERANCE**2)[0]
+        return float(products[-1, -1] - products[:-1, -1] @ theta), theta[:-1] / scale
 
     ladder = np.geomspace(0.5, longest / 3.0, _TIME_CONSTANT_COUNT)
     tau = float(min(ladder, key=lambda tau: fit(tau, 0)[0]))
@@ -159,6 +162,26 @@ def _fit_low_pass(inputs: Sequence[Matrix], outputs: Sequence[Vector]) -> tuple[
     return best[1], fit(best[1], best[2])[1], best[2]
 
 
+def _low_pass_products(U: Matrix, y: Vector, tau: float, late: int) -> Matrix:
+    """Return the inner products of one run's regressors and output, without the part that decays from its start.
+
+    The regressors are the low-passed inputs U (motors, time) and a constant; the output y (time,) comes last.
+    """
+    from scipy.signal import lfilter
+
+    pole, missing = np.exp(-1.0 / tau), ~np.isfinite(y)
+    shift = min(late + 1, y.size)  # y(k+1) depends on u(k - late)
+    Z = np.ones((len(U) + 2, y.size))
+    Z[:-2, :shift] = U[:, :1]
+    Z[:-2, shift:] = lfilter([1.0 - pole], [1.0, -pole], U, zi=pole * U[:, :1])[0][:, : y.size - shift]
+    Z[-1] = y
+    Z[:, missing] = 0.0
+    start = pole ** np.arange(min(y.size, 1 + int(_DECAYED * tau)))
+    start[missing[: start.size]] = 0.0
+    decayed = Z[:, : start.size] @ start / np.sqrt(max(start @ start, np.finfo(float).tiny))
+    return Z @ Z.T - np.outer(decayed, decayed)
+
+
 def _independent(weights: Matrix) -> Matrix:
     """Return the rows that are not nearly a combination of the rows before them."""
     kept: list[Vector] = []
@@ -166,17 +189,6 @@ def _independent(weights: Matrix) -> Matrix:
         if np.linalg.matrix_rank(np.array([*kept, row]), tol=0.1) > len(kept):
             kept.append(row)
     return np.array(kept)
-
-
-def _low_pass_columns(U: Matrix, pole: float, late: int, run: int, runs: int) -> Matrix:
-    """Return the regressors of one run: low-passed inputs, a constant of all runs, and the run's own start."""
-    from scipy.signal import lfilter
-
-    delayed = np.vstack([np.repeat(U[:1], late + 1, axis=0), U])[: len(U)]  # y(k+1) depends on u(k - late)
-    X = lfilter([1.0 - pole], [1.0, -pole], delayed, axis=0, zi=pole * delayed[:1])[0]
-    starts = np.zeros((len(X), runs))
-    starts[:, run] = pole ** np.arange(len(U))
-    return np.column_stack([X, np.ones(len(X)), starts])
 
 
 #: The tests of section 4, which the paper's models never saw.

@@ -65,6 +65,31 @@ def _unit_factors(robot: Robot, names: Sequence[str], units: str) -> tuple[float
     return 1.0 / to_si(shown)[0], to_si(motor)[0], [f"{name} [{known.get(name, motor)}]" for name in names]
 
 
+def to_state_space(system: Any) -> Any:
+    """Return a `control` system of any size as state space, with the names of its signals.
+
+    By scipy: python-control takes slycot where it is installed, whose rounding makes another design.
+    """
+    import control
+    from scipy.linalg import block_diag
+
+    if isinstance(system, control.StateSpace):
+        return system
+    inputs, outputs = np.eye(system.ninputs), np.eye(system.noutputs)
+    try:
+        parts: list[Any] = [
+            control.ss(control.TransferFunction(above, below, system.dt), method="scipy")
+            for row in zip(system.num, system.den, strict=True) for above, below in zip(*row, strict=True)
+        ]  # fmt: skip
+    except ValueError as error:
+        raise SettingsError("a transfer function has more zeros than poles; it must be proper.") from error
+    A = block_diag(*(part.A for part in parts))
+    B = np.vstack([np.kron(inputs[[k % len(inputs)]], part.B) for k, part in enumerate(parts)])
+    C = np.hstack([np.kron(outputs[:, [k // len(inputs)]], part.C) for k, part in enumerate(parts)])
+    D = np.reshape([part.D for part in parts], (len(outputs), len(inputs)))
+    return control.StateSpace(A, B, C, D, system.dt, inputs=system.input_labels, outputs=system.output_labels)
+
+
 def state_space(model: Any, units: str = "SI") -> control.StateSpace:
     """Return one discrete state space of all outputs, over motors or redefined inputs as the model has them."""
     import control
@@ -76,7 +101,7 @@ def state_space(model: Any, units: str = "SI") -> control.StateSpace:
         A, B, C = _add_input_delay(A, B, C, int(model.arrays["delay"][0]))
         inputs = robot.set_points
     else:
-        parts = [control.ss(transfer_function(model, output, None)) for output in robot.outputs.names]
+        parts = [to_state_space(transfer_function(model, output, None)) for output in robot.outputs.names]
         joined: Any = control.append(*parts)
         A, B, C = np.asarray(joined.A), np.asarray(joined.B), np.asarray(joined.C)
         inputs = robot.input_names
@@ -104,6 +129,7 @@ def continuous_function(
     """Return the continuous-time transfer function that a zero-order hold discretizes to the model's."""
     import control
     from scipy.linalg import logm
+    from scipy.signal import ss2tf
 
     name = _checked_input(model, output, input)
     require_whole("pade", pade, 0, 12)
@@ -112,7 +138,7 @@ def continuous_function(
     # Poles at zero are dead time, beyond the one sample that a strictly proper system has itself.
     at_zero = below.size - np.trim_zeros(below, "b").size
     delay = min(at_zero, below.size - above.size - 1) if above.size else 0
-    S: Any = control.ss(control.TransferFunction(above, below[: below.size - delay], model.sample_time))
+    S = to_state_space(control.TransferFunction(above, below[: below.size - delay], model.sample_time))
     poles = np.linalg.eigvals(S.A)
     if (np.abs(poles) < 1e-9).any() or ((np.abs(poles.imag) < 1e-12) & (poles.real <= 0.0)).any():
         raise SettingsError(
@@ -122,8 +148,8 @@ def continuous_function(
     joint = np.eye(n + 1)
     joint[:n, :n], joint[:n, n:] = S.A, S.B
     L = np.real(logm(joint)) / model.sample_time
-    continuous: Any = control.ss2tf(control.StateSpace(L[:n, :n], L[:n, n:], S.C, S.D))
-    G = control.TransferFunction(np.asarray(continuous.num[0][0]), np.asarray(continuous.den[0][0]))
+    above, below = ss2tf(L[:n, :n], L[:n, n:], S.C, S.D)
+    G = control.TransferFunction(above[0], below)
     if pade > 0 and delay > 0:
         G = G * control.TransferFunction(*control.pade(delay * model.sample_time, pade))
     return _convert_units(model, (np.asarray(G.num[0][0]), G.den), (name, output), angle_unit, units)
