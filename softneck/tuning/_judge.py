@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from softneck.core import KINDS, DataError, SoftneckError, Vector, make_settings, resolve, silent, to_si, worst
+from softneck.core import KINDS, DataError, Matrix, SoftneckError, Vector, make_settings, resolve, silent, to_si, worst
 from softneck.design import AxisSettings, UncertainPlant, uncertain_plant
 from softneck.identification import payloads
 from softneck.loop import Loop, LoopResult, Reference, RobotReference, SensorFault, run_loop
@@ -224,13 +224,13 @@ _PLANT_COUNT = 48
 class Ready:
     """Objects that a worker prepares once per task.
 
-    `plants`: linear ones, without the delay that a loop's order adds. `weights`: of the motors in each axis's input.
-    `uncertain`: plant of the linear designs. `own`: simulation models. `all`: loops of the level `all`. `kept`: designs
-    by kind and settings.
+    `plants`: linear ones, without the delay that a loop's order adds. `weights`: for each source of plants, those of
+    the motors in each axis's input. `uncertain`: plant of the linear designs. `own`: simulation models. `all`: loops of
+    the level `all`. `kept`: designs by kind and settings.
     """
 
     plants: Plants
-    weights: Any
+    weights: list[Matrix]
     uncertain: UncertainPlant
     own: tuple[SimulationModel, ...]
     all: tuple[Case, ...]
@@ -268,7 +268,7 @@ def prepare(task: Task) -> Ready:
         plants = all_plants(sources, _PLANT_COUNT, int(certificate.sampling["seed"]))
         own = tuple(make_simulation_model(thing, name, task.robot) for name, thing in task.own.items())
         kept["ready"] = Ready(
-            plants, sources[0].weights, uncertain_plant(task.plant), own,
+            plants, [source.weights for source in sources], uncertain_plant(task.plant), own,
             cases(own, task.asked, task.robot, task.drawn),
         )  # fmt: skip
     return kept["ready"]
@@ -485,7 +485,7 @@ def linear_curves(task: Task, ready: Ready, controller: Any) -> dict[str, list[f
 def _step_curves(task: Task, ready: Ready, y: np.ndarray, P: np.ndarray) -> dict[str, Any]:
     """Return the curves of outputs `y` (plants, n) and of set-points `P` (n, motors) over the last plant."""
     unit = to_si(task.robot.motors.unit)[0]
-    T, inverse = task.robot.redefinition(ready.weights)
+    T, inverse = task.robot.redefinition(ready.weights[0])
     found = {"low": y.min(axis=0), "high": y.max(axis=0), "value": y[-1]}
     found |= {f"set_point_{j}": values / unit for j, values in enumerate(P.T, start=1)}
     return found | ({"tautness": P @ T[-1] / unit} if inverse[:, -1].any() else {})

@@ -158,8 +158,8 @@ def _linear_evidence(
     linear = [_linear(law, plants, sources, controller.extra, asked) for law in controller.laws.values()]
     progress(0.4, "steps against every plant")
     stepped = join([plants, *(part.plants.take(np.arange(len(plants), len(part.plants))) for part in linear)])
-    test, weights = asked.step_test(seed), sources[0].weights
-    steps = run_steps(stepped, controller.block, test, robot=controller.robot, weights=weights)
+    weights = [source.weights for source in sources]
+    steps = run_steps(stepped, controller.block, asked.step_test(seed), robot=controller.robot, weights=weights)
     steep = float(asked.uncertainty["rolloff_db_per_decade"])
     laws = controller.laws.values()
     tested = [item for law in laws for item in data_margins(families, law, plants.axes, controller.extra, steep)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -74,43 +74,51 @@ def check_ports(block: Block, robot: Robot) -> None:
 
 
 def run_steps(
-    plants: Plants, block: Block, test: StepTest, *, robot: Robot | None = None, weights: Matrix | None = None
+    plants: Plants, block: Block, test: StepTest, *, robot: Robot | None = None, weights: Sequence[Matrix] = ()
 ) -> Steps:
     """Return the responses of all plants, which include the delay of the loop's order, with a controller `block`.
 
-    `robot` None is the neck, `weights` (axes, motors) None those of the robot.
+    `robot` None is the neck, `weights` (axes, motors) those of each source of plants; without, they are the robot's.
     """
     whose = Robot.preset() if robot is None else robot
-    T = whose.redefinition(weights)[0]
-    m, around = len(plants.axes), middle_of(whose)
-    before = T @ middle_motors(whose, block)
-    Ts = plants.sample_time
+    m, n, Ts = len(plants.axes), len(plants), plants.sample_time
     half = round(test.duration / Ts)
-    rows = 2 * half
-    # Motors start at zero; those with another operating point are moved there before the test.
-    first = rows if before.any() else 0
-    rng = np.random.default_rng(test.seed)
-    noise = test.noise * rng.standard_normal((rows, m))
-    angles, motors, other = [], [], []
-    for axis in range(m):
-        signals = np.zeros((first + rows, 3 * m + 1))
-        signals[:, :m], signals[:, m] = around, before[m]
-        signals[first:, axis] += test.step
-        signals[:, m + 1 : 2 * m + 1] = around
-        signals[first:, m + 1 : 2 * m + 1] += noise
-        # The plants are linear around that point.
-        signals[:, 2 * m + 1 :] -= before[:m]
-        signals[first + half :, 2 * m + 1 + axis] += test.load
-        y, P = _run(plants, block, signals, T, whose)
-        y, P = y[:, first:], P[:, first:]
-        angles.append(y[:, :, axis])
-        other.append(np.delete(y[:, :half], axis, axis=2))
-        motors.append(P)
-    parts = [_metrics(angles[i], other[i], test, half, Ts, error_unit(whose)[1]) for i in range(m)]
+    angles, motors = np.empty((m, n, 2 * half, m)), np.empty((m, n, 2 * half, len(whose.set_points)))
+    for number, each in enumerate(weights or [None]):
+        mine = plants.source == number if weights else np.full(n, True)
+        if not mine.any():
+            continue
+        T = whose.redefinition(each)[0]
+        for axis in range(m):
+            signals = _step_signals(axis, T @ middle_motors(whose, block), middle_of(whose), test, half)
+            y, P = _run(plants.take(np.flatnonzero(mine)), block, signals, T, whose)
+            angles[axis, mine], motors[axis, mine] = y[:, -2 * half :], P[:, -2 * half :]
+    own = [angles[i, :, :, i] for i in range(m)]
+    other = [np.delete(angles[i, :, :half], i, axis=2) for i in range(m)]
+    parts = [_metrics(own[i], other[i], test, half, Ts, error_unit(whose)[1]) for i in range(m)]
     table = {name: np.stack([part[name] for part in parts]) for name in METRICS}
     worst = {name: values.max(axis=0) for name, values in table.items()}
     worse = {name: values.argmax(axis=0) for name, values in table.items()}
-    return Steps(np.arange(rows) * Ts, np.array(angles), np.array(motors), worst, worse)
+    return Steps(np.arange(2 * half) * Ts, np.array(own), motors, worst, worse)
+
+
+def _step_signals(axis: int, before: Vector, around: Vector, test: StepTest, half: int) -> Matrix:
+    """Return references, co-contraction, measurement noise and loads (time, 3 m + 1) of the step of one axis.
+
+    before: the redefined inputs around which steps are made; around: the outputs there.
+    """
+    m, rows = around.size, 2 * half
+    # Motors start at zero; those with another operating point are moved there before the test.
+    first = rows if before.any() else 0
+    signals = np.zeros((first + rows, 3 * m + 1))
+    signals[:, :m], signals[:, m] = around, before[m]
+    signals[first:, axis] += test.step
+    signals[:, m + 1 : 2 * m + 1] = around
+    signals[first:, m + 1 : 2 * m + 1] += test.noise * np.random.default_rng(test.seed).standard_normal((rows, m))
+    # The plants are linear around that point.
+    signals[:, 2 * m + 1 :] -= before[:m]
+    signals[first + half :, 2 * m + 1 + axis] += test.load
+    return signals
 
 
 def middle_of(robot: Robot) -> Vector:

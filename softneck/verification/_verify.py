@@ -170,6 +170,9 @@ class Verification(ReprMixin):
         with _new_files_removed_on_failure(Path(folder)):
             return self._write_worst(Path(folder), *paths, force)
 
+    def _source_of(self, plant: str) -> PlantSource:
+        return next(source for source in self.necks if plant.startswith(f"{source.name}: "))
+
     def _write_worst(self, target: Path, controller: Path, observer: Path | None, force: bool) -> dict[int, Path]:
         files: dict[int, Path] = {}
         axes = self.controller.robot.outputs.names
@@ -183,7 +186,7 @@ class Verification(ReprMixin):
                 }  # fmt: skip
                 files[number] = write_linear(
                     target, name, facts, controller=controller, asked=self.requirements,
-                    block=self.controller.block, weights=self.necks[0].weights, force=force,
+                    block=self.controller.block, weights=self._source_of(worst["name"]).weights, force=force,
                 )  # fmt: skip
             elif worst.get("kind") == "neck":
                 paths = controller, observer

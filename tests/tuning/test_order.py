@@ -349,7 +349,7 @@ PAIR: Any = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.
 def test_curves_have_set_points_and_their_common_part_in_the_motors_unit() -> None:
     # Of the last plant. What moves no output is the mean of four chambers in a ring, and nothing where each is alone.
     y, P = np.array([[0.0, 3.0], [2.0, 1.0]]), 1e5 * np.array([[1.0, 1.0, 1.0, 1.0], [0.5, 1.0, 2.0, 2.5]])
-    ring: Any = SimpleNamespace(weights=np.eye(3, 4) - np.eye(3, 4, 1))
+    ring: Any = SimpleNamespace(weights=[np.eye(3, 4) - np.eye(3, 4, 1)])
     task = task_for({}, robot=BELLOWS)
     found = {name: list(values) for name, values in _judge._step_curves(task, ring, y, P).items()}
     assert found.pop("tautness") == pytest.approx([1.0, 1.5])
@@ -357,10 +357,10 @@ def test_curves_have_set_points_and_their_common_part_in_the_motors_unit() -> No
         "low": [0.0, 1.0], "high": [2.0, 3.0], "value": [2.0, 1.0],
         **{f"set_point_{j + 1}": list(P[:, j] / 1e5) for j in range(4)},
     }  # fmt: skip
-    alone: Any = SimpleNamespace(weights=LEARNED)
+    alone: Any = SimpleNamespace(weights=[LEARNED])
     assert _judge._step_curves(task, alone, y, P).keys() == found.keys()
     # Two of four that pull against each other are enough: their part of the mean.
-    pair: Any = SimpleNamespace(weights=PAIR)
+    pair: Any = SimpleNamespace(weights=[PAIR])
     assert _judge._step_curves(task, pair, y, P)["tautness"] == pytest.approx([0.5, 0.375])
 
 
@@ -634,7 +634,7 @@ def test_curves_are_of_the_plain_steps_from_the_lowest_to_the_highest(monkeypatc
     monkeypatch.setattr(_judge, "run_loop", result)
 
     def curves(cases: list[Case]) -> dict[str, list[float]]:
-        ready: Any = SimpleNamespace(all=cases, own=plants, weights=None)
+        ready: Any = SimpleNamespace(all=cases, own=plants, weights=[None])
         return _judge.loop_curves(task, ready, None, "sequential")  # pyright: ignore[reportArgumentType]
 
     found = curves(every)
@@ -677,7 +677,7 @@ def test_linear_curves_are_of_the_first_output_with_the_nominal_plant_last(monke
     def run(plants: Any, block: Any, test: Any, **more: Any) -> Any:
         tests.append(test)
         assert (plants, block) == (("later", 1), "block")
-        assert more == {"robot": task.robot, "weights": None}
+        assert more == {"robot": task.robot, "weights": [None]}
         return SimpleNamespace(time=t, angles=y, motors=P)
 
     def alone(controller: Any, **more: Any) -> Any:
@@ -688,7 +688,7 @@ def test_linear_curves_are_of_the_first_output_with_the_nominal_plant_last(monke
     monkeypatch.setattr(_judge, "run_steps", run)
     monkeypatch.setattr(_judge, "controller_under_test", alone)
     task = task_for({"step": {"duration_s": 4.0}})
-    found = _judge.linear_curves(task, SimpleNamespace(plants=plants, weights=None), "c")  # pyright: ignore[reportArgumentType]
+    found = _judge.linear_curves(task, SimpleNamespace(plants=plants, weights=[None]), "c")  # pyright: ignore[reportArgumentType]
     assert (tests[0].noise, tests[0].load) == (0.0, 0.0)
     ends = [found[name][-1] for name in ("low", "high", "value")]
     assert ends == pytest.approx([math.degrees(v) for v in (0.1, 0.3, 0.2)], rel=1e-3)

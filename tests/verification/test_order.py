@@ -561,20 +561,21 @@ def test_the_worst_plant_of_each_requirement_is_written_as_what_it_is(
     monkeypatch.setattr(_verify, "write_linear", lambda *args, **more: written.append((args, more)) or Path("linear"))
     monkeypatch.setattr(_verify, "write_neck", lambda *args, **more: written.append((args, more)) or Path("neck"))
     item = Requirement("axes.gain_margin", "min", 2.0, True)
-    line = {"kind": "linear", "name": "n", "numerator": [1], "denominator": [2], "delay_samples": [3], "cross": [0.1],
-            "sample_time_s": TS}  # fmt: skip
+    line = {"kind": "linear", "name": "b: n", "numerator": [1], "denominator": [2], "delay_samples": [3],
+            "cross": [0.1], "sample_time_s": TS}  # fmt: skip
+
     worst = [{**line, "axis": "roll"}, {**line, "axis": "both"}, {"kind": "neck", "name": "k"}, {"kind": "draw"}, {}]
     verdicts = [Verdict(item, 1.0, False, one) for one in worst]
     under: Any = SimpleNamespace(robot=Robot.preset(), block="block")
     evidence: Any = None
-    necks: Any = [SimpleNamespace(weights="W"), SimpleNamespace(weights="V")]
+    necks: Any = [SimpleNamespace(name="a", weights="W"), SimpleNamespace(name="b", weights="V")]
     found = Verification(verdicts=verdicts, evidence=evidence, controller=under, necks=necks, observer=True,
                          requirements=make_requirements({}))  # fmt: skip
     files = found.write_worst("to", controller="c.npz", observer="o.npz", force=True)
     assert files == {0: Path("linear"), 1: Path("linear"), 2: Path("neck")}
     assert [args[2]["axis"] for args, _ in written[:2]] == [1, 0]
     assert written[0][0][:2] == (Path("to"), "axes_gain_margin")
-    assert (written[0][1]["weights"], written[0][1]["controller"], written[0][1]["force"]) == ("W", Path("c.npz"), True)
+    assert (written[0][1]["weights"], written[0][1]["controller"], written[0][1]["force"]) == ("V", Path("c.npz"), True)
     assert written[2][0][2:] == ({"kind": "neck", "name": "k"}, Path("c.npz"), Path("o.npz"))
     found.write_worst("to", controller="c.npz")
     assert written[-1][0][-1] is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from softneck.verification import make_requirements, verify
 from softneck.verification._experiments import Experiment, LoopUnderTest, _first_crossing, crossings
 from softneck.verification._linear import LinearLaw, margins, radii
 from softneck.verification._neck_loops import make_simulation_model
-from softneck.verification._plants import all_plants, mixing_matrix, off_diagonal, source_of_model
+from softneck.verification._plants import all_plants, join, mixing_matrix, off_diagonal, source_of_model
 from softneck.verification._requirements import read_requirements
 from softneck.verification._steps import StepTest, run_steps
 from softneck.verification._verify import sources_of
@@ -146,19 +147,22 @@ def test_steps_of_a_robot_are_those_of_its_equations() -> None:
     model = plant(BELLOWS, gain=1e-7)
     controller = design_controller("pi", model, robot=SLOW)
     plants = all_plants(sources_of({"m": model}, make_requirements(FEW, robot=BELLOWS)), 1, 0).take([0])
+    # A second source has learned other directions.
+    plants, directions = join([plants, replace(plants, source=np.array([1]))]), [LEARNED, 0.9 * LEARNED]
     assert plants.unit == "m_per_Pa"  # of `static_gain_m_per_Pa` in a certificate
     test = StepTest(step=1e-3, duration=2.0, noise=0.0, load=0.0, seed=0)
-    steps = run_steps(plants, controller.block(), test, robot=BELLOWS, weights=LEARNED)
-    for i in range(3):
-        P, y = steps.motors[i, 0], 0.0
+    steps = run_steps(plants, controller.block(), test, robot=BELLOWS, weights=directions)
+    for i, number in itertools.product(range(3), range(2)):
+        P, y = steps.motors[i, number], 0.0
         # Around the middle of 0 to 3 bar: at one end the directions, of both signs, could move nothing.
-        v = (P - 1.5e5) @ LEARNED[i]
+        v = (P - 1.5e5) @ directions[number][i]
         assert P.min() >= 0.0
         for k in range(steps.time.size):
             # 1e-9 of what the motors were brought there for, 30 mm.
-            assert steps.angles[i, 0, k] == pytest.approx(y, abs=3e-11)
+            assert steps.angles[i, number, k] == pytest.approx(y, abs=3e-11)
             y = 0.9 * y + 0.1 * 1e-7 * (v[k - 3] if k >= 3 else 0.0)
-        assert y == pytest.approx(1e-3, rel=0.05)
+        if not number:
+            assert y == pytest.approx(1e-3, rel=0.05)
 
 
 def test_what_does_not_fit_is_refused() -> None:

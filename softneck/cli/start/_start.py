@@ -100,8 +100,6 @@ def command(
         run.answers = {key: value for key, value in asdict(options).items() if key in given}
         options = replace(options, backend=backend(), tested=has_pytest())
         not_run = {} if options.tested else {"test": "pytest is not installed"}
-        for stage, why in not_run.items():
-            note(f"not run: {stage}: {why}")
         if not as_json:
             click.echo(f"$ cd {folder}")
         try:

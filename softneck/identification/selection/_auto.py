@@ -18,7 +18,6 @@ from softneck.core import (
     Progress,
     ReprMixin,
     SettingsError,
-    SoftneckError,
     one_blas_thread,
     resolve,
     side_by_side,
@@ -46,7 +45,17 @@ from ..structured._greybox import as_found
 from ..uncertainty._guarded import BASES, OF, Guarded, fitted_base
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
-from ._examination import HOLD_OUT, POOR_FIT_PCT, SECOND, SHORT, Examination, Fits, second_training, unseen_rows
+from ._examination import (
+    HOLD_OUT,
+    NOT_FITTED,
+    POOR_FIT_PCT,
+    SECOND,
+    SHORT,
+    Examination,
+    Fits,
+    second_training,
+    unseen_rows,
+)
 
 EXAM, COLD = "agreement", "cold start"
 # What is in a model file but was not found from data: sizes, tables, copies of rows in another order; and what says how
@@ -128,11 +137,6 @@ def _failure_reasons(ranking: Sequence[KindTrial]) -> str:
     if len(said) == 1:
         return next(iter(said))
     return "; ".join(f"{', '.join(kinds)}: {why}" for why, kinds in said.items())
-
-
-def _reason(error: Exception) -> str:
-    """Return why a kind was not identified; an internal error is named by its type."""
-    return str(error) if isinstance(error, SoftneckError) else f"{type(error).__name__}: {error}"
 
 
 def _progress_text(kind: str, tried: list[KindTrial]) -> str:
@@ -339,8 +343,8 @@ class _Race:
             model = self.short[kind] = self._short(kind, fold.train)
             seconds = time.perf_counter() - begin
             found = {part.name: part.fits(model) for part in (*fold.judged, all_rows(HOLD_OUT, self.hold_out))}
-        except Exception as error:  # one kind never ends the search
-            self.tried[kind] = KindTrial(kind, time.perf_counter() - begin, failure=_reason(error))
+        except NOT_FITTED as error:  # one kind never ends the search
+            self.tried[kind] = KindTrial(kind, time.perf_counter() - begin, failure=str(error))
             return
         self.tried[kind] = _with(KindTrial(kind, seconds, model, whole=False), found)
 
@@ -365,7 +369,7 @@ class _Race:
         try:
             model = self._short(kind, fold.train)
             found = {part.name: part.fits(model) for part in fold.judged}
-        except Exception:  # one kind never ends the search
+        except NOT_FITTED:  # one kind never ends the search
             lost = dict.fromkeys(fold.train.robot.outputs.names, float("-inf"))
             found = {part.name: (lost, float("nan")) for part in fold.judged}
         one = self.tried[kind]
@@ -422,8 +426,8 @@ class _Race:
                 parts = [best.model, self.short[best.kind]]
                 model = replace(settings, members=len(parts)).around(base, parts, self.train)
             judged = self._validate("guarded", model)
-        except Exception as error:  # one kind never ends the search
-            self.tried["guarded"] = KindTrial("guarded", time.perf_counter() - begin, failure=_reason(error))
+        except NOT_FITTED as error:  # one kind never ends the search
+            self.tried["guarded"] = KindTrial("guarded", time.perf_counter() - begin, failure=str(error))
             return best
         fits = all_rows(HOLD_OUT, self.hold_out).fits(model)[0]
         outputs = {**best.outputs, HOLD_OUT: fits, **self._each_held_out(model)}
@@ -452,8 +456,8 @@ class _Race:
             outputs = {**one.outputs, HOLD_OUT: fits, **self._each_held_out(model)}
             if self.folds[0].judged:
                 outputs[SECOND] = second_training(model, self.short[kind], self.folds[0])
-        except Exception as error:  # one kind never ends the search
-            return KindTrial(kind, one.seconds, failure=_reason(error))
+        except NOT_FITTED as error:  # one kind never ends the search
+            return KindTrial(kind, one.seconds, failure=str(error))
         one = replace(one, seconds=one.seconds + time.perf_counter() - begin, errors={**one.errors, HOLD_OUT: error})
         return replace(one, model=model, judged=judged, whole=True, outputs=outputs)
 

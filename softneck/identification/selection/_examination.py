@@ -30,6 +30,8 @@ from ..structured._greybox import as_found
 HOLD_OUT, SECOND = "hold-out", "second training"
 OF_ONE_MOTION = ("largest motions", "fastest motions", "later block", SECOND)
 Fits = Mapping[str, float]
+# What a fit raises where the data determine no model; whatever else it raises is a fault of ours, and not hidden.
+NOT_FITTED = (SoftneckError, np.linalg.LinAlgError)
 # Cheaper settings of the same method: fewer starts and steps.
 SHORT: dict[str, dict[str, Any]] = {
     "greybox": {"evaluations": 15, "sensor_delay": 2, "body": "rigid"},
@@ -138,7 +140,7 @@ def examine(
         progress(number / len(left_out), f"without {fold.judged[0].name}")
         try:
             again = shortened(settings, model.kind).fit(fold.train)
-        except Exception:  # what is left of a short recording may determine no model: the whole one stands
+        except NOT_FITTED:  # what is left of a short recording may determine no model: the whole one stands
             continue
         parts |= {part.name: part.fits(again)[0] for part in fold.judged}
         if not number:
@@ -181,7 +183,7 @@ def fits_to_reference(model: Model, again: Model, fold: Fold) -> tuple[str, Fits
             continue
         try:
             reference = resolve(KINDS[kind].settings)(**settings).fit(fold.train)
-        except (SoftneckError, np.linalg.LinAlgError):  # a kind for other robots, or for more rows
+        except NOT_FITTED:  # a kind for other robots, or for more rows
             continue
         known = _least_fit(reference, fold)
         if known >= POOR_FIT_PCT and 2.0 * (100.0 - known) ** 2 <= (100.0 - own) ** 2:

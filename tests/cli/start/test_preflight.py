@@ -89,7 +89,7 @@ def test_without_a_compiler_and_without_pytest_it_goes_on_and_says_so(
     assert said.code == 0, said.err
     assert (asked[0].backend, asked[0].tested) == ("python", False)
     assert "no C compiler was found: the FMUs are written with the Python backend" in said.err
-    assert "not run: test: pytest is not installed" in said.err
+    assert "pytest" not in said.err  # where the input is bad, its absence is not the first line
     assert "not run: pytest is not installed" in said.out
 
 
