@@ -29,7 +29,7 @@ from softneck.design import NmpcSettings
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings, NonlinearObserver
 from softneck.identification import Family, FamilySettings, GreyBox, Model, OutputError
-from softneck.loop import BlockPart, Loop, LoopResult, Part, StepReference, metrics, run_loop
+from softneck.loop import BlockPart, Loop, LoopResult, Part, RobotReference, metrics, run_loop
 from softneck.loop._references import AheadReference
 from softneck.signals import (
     Excitation,
@@ -118,11 +118,11 @@ def controller_cell(cell: Cell) -> dict[str, Any]:
 
     overshoot, rise, swings, around, ahead = [], [], [], [], []
     for kg in JUDGED:
-        for axis in ("pitch", "roll"):
-            found = metrics(run(StepReference(**{axis: STEP}, at=AT), AT + STEP_S, kg))[axis]
+        for axis, sizes in (("pitch", (STEP, 0.0)), ("roll", (0.0, STEP))):
+            found = metrics(run(RobotReference(kind="step", values=sizes, at=AT), AT + STEP_S, kg))[axis]
             overshoot.append(found["overshoot_pct"] or 0.0)
             rise.append(found["rise_s"] or STEP_S)
-        loud = run(StepReference(pitch=STEP, at=AT), AT + STEP_S, kg, 2.0)
+        loud = run(RobotReference(kind="step", values=(STEP, 0.0), at=AT), AT + STEP_S, kg, 2.0)
         swings.append(max(float(np.ptp(np.degrees(loud[axis][-100:]))) for axis in ("pitch", "roll")))
         turned = run(circle, CIRCLE_S, kg)
         errors = [_distance(turned, lead) for lead in range(0, 30 if "/" not in cell.kind else 1)]

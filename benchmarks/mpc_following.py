@@ -29,7 +29,7 @@ from softneck.design.linear._axis_loop import rise_time
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings, NonlinearObserver
 from softneck.identification import Family, FamilySettings, GreyBox, OutputError
-from softneck.loop import BlockPart, Loop, LoopResult, Reference, StepReference, metrics, run_loop
+from softneck.loop import BlockPart, Loop, LoopResult, Reference, RobotReference, metrics, run_loop
 from softneck.loop._references import AheadReference
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant import record as record_own
@@ -182,7 +182,7 @@ def followed(on: Specimen, settings: MpcNumbers, payload: float, seed: int = 0) 
 
 def _step(on: Specimen, controller: MpcController, axis: str, payload: float, seed: int) -> list[float]:
     """Return overshoot [%], rise [s], steady rms and rms error from the step on [deg]."""
-    reference = StepReference(**{axis: STEP}, at=AT)
+    reference = RobotReference(kind="step", values=tuple(STEP * (axis == each) for each in AXES), at=AT)
     result = run(on, controller, reference, AT + STEP_S, payload, seed)
     found = metrics(result)
     steady = max(float(found[each]["steady_rms_deg"] or 0.0) for each in AXES)

@@ -33,7 +33,7 @@ import softneck
 from benchmarks.promises import AMPLITUDES, SHOWN, Sensed, block_of, experiments, recorded, taut
 from softneck.core import KINDS, resolve
 from softneck.identification import FamilySettings, GreyBox
-from softneck.loop import BlockPart, Loop, LoopResult, RotationReference, StepReference, metrics, run_loop
+from softneck.loop import BlockPart, Loop, LoopResult, RobotReference, metrics, run_loop
 from softneck.signals import signal
 from softneck.tuning import tune
 from softneck.tuning._judge import design_candidate, prepare
@@ -74,7 +74,7 @@ def truth(neck: str, controller: Any, ahead: float) -> dict[str, float]:
     for seed, kg in enumerate(JUDGED):
         for angle in ORIENTATIONS:
             share = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-            step = StepReference(pitch=SIZE * share[0], roll=SIZE * share[1], at=3.0)
+            step = RobotReference(kind="step", values=(SIZE * share[0], SIZE * share[1]), at=3.0)
             found = metrics(run(neck, block, step, kg, seed, 8.0))
             stepped = [found[axis] for axis, part in zip(("pitch", "roll"), share, strict=True) if part > 0.05]
             for name, key in (("overshoot", "overshoot_pct"), ("rise", "rise_s")):
@@ -83,7 +83,7 @@ def truth(neck: str, controller: Any, ahead: float) -> dict[str, float]:
             worst["steady"] = max(
                 [worst["steady"], *(found[axis]["steady_rms_deg"] or 0.0 for axis in ("pitch", "roll"))]
             )
-        circle = RotationReference(inclination=CIRCLE, frequency=TURN / (2.0 * math.pi), at=3.0, rise=2.0)
+        circle = RobotReference(kind="rotation", values=(CIRCLE,), frequency=TURN / (2.0 * math.pi), at=3.0, rise=2.0)
         result = run(neck, block, circle, kg, seed, 5.0 + 4.0 * math.pi / TURN)
         for name, lead in (("circle", 0.0), ("ahead", ahead)):
             worst[name] = max(worst[name], distance(result, round(lead / result.sample_time)))

@@ -5,13 +5,10 @@ from ._faults import SensorFault as SensorFault
 from ._loop import BlockPart as BlockPart
 from ._loop import Loop as Loop
 from ._loop import Part as Part
-from ._references import RampReference as RampReference
 from ._references import RecordingReference as RecordingReference
 from ._references import Reference as Reference
 from ._references import ReferenceBlock as ReferenceBlock
-from ._references import RotationReference as RotationReference
-from ._references import SineReference as SineReference
-from ._references import StepReference as StepReference
+from ._references import RobotReference as RobotReference
 from ._result import LoopResult as LoopResult
 from ._result import check_limits as check_limits
 from ._result import metrics as metrics
@@ -30,7 +27,6 @@ from ._loop import EndedError as EndedError
 from ._loop import Link as Link
 from ._loop import System as System
 from ._references import AheadReference as AheadReference
-from ._references import RobotReference as RobotReference
 from ._references import make_reference as make_reference
 from ._references import reference_field as reference_field
 from ._references import reference_keys as reference_keys

@@ -130,26 +130,6 @@ def reference(kind: str, values: Mapping[str, float], robot: Robot = _NECK) -> R
     return RobotReference(kind=kind, values=tuple(wanted.values()), cocontraction=common, **times)
 
 
-def StepReference(**values: float) -> RobotReference:
-    """Return a step of a neck: `pitch`, `roll`, `cocontraction` [rad], `at` [s]."""
-    return reference("step", values)
-
-
-def RampReference(**values: float) -> RobotReference:
-    """Return a ramp of a neck: `pitch`, `roll`, `cocontraction` [rad], `at`, `rise` [s]."""
-    return reference("ramp", values)
-
-
-def SineReference(**values: float) -> RobotReference:
-    """Return a sine of a neck: `pitch`, `roll`, `cocontraction` [rad], `frequency` [Hz], `at` [s]."""
-    return reference("sine", values)
-
-
-def RotationReference(**values: float) -> RobotReference:
-    """Return a rotation of a neck: `inclination`, `cocontraction` [rad], `frequency` [Hz], `at`, `rise` [s]."""
-    return reference("rotation", values)
-
-
 def make_reference(kind: str, values: Mapping[str, object], robot: Robot = _NECK) -> RobotReference:
     """Return a reference from the keys of a loop file: `x_mm = 10`, or `x = 10` in its display unit; `at_s`.
 

@@ -22,10 +22,11 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from softneck.core import Vector
 from softneck.cosim import FmuPart, simulate, write_ssp
 from softneck.fmu import unpacked
-from softneck.loop import Loop, StepReference
+from softneck.loop import Loop
 from softneck.runtime import Port
 
 from ..cosim._foreign import NAMES, build_foreign
+from ..references import StepReference
 
 STEPS, TS = 5_000, 0.02
 # Processor time: other work on the machine shall not count.

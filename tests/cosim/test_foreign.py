@@ -15,8 +15,9 @@ import pytest
 from softneck.core import DataError, FileFormatError, SettingsError
 from softneck.cosim import FmuError, FmuPart, IsolatedPart, load_loop, shown_name, simulate
 from softneck.cosim.loops._loop_file import LoopSetup
-from softneck.loop import BlockPart, Loop, SensorFault, StepReference
+from softneck.loop import BlockPart, Loop, SensorFault
 
+from ..references import StepReference
 from ._foreign import NAMES, build_foreign
 
 TS = 0.02

@@ -13,9 +13,10 @@ import pytest
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
 from softneck.cosim import FmuPart, load_loop, simulate
 from softneck.fmu import build_fmu
-from softneck.loop import BlockPart, Loop, NeckFault, SensorFault, StepReference
+from softneck.loop import BlockPart, Loop, NeckFault, SensorFault
 from softneck.signals import read_recording, write_recording
 
+from ..references import StepReference
 from .conftest import LOOP
 
 

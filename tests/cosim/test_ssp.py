@@ -19,9 +19,10 @@ from softneck.core import OutputFileError, SettingsError
 from softneck.cosim import load_loop, load_ssp, simulate, write_ssp
 from softneck.cosim.loops._loop_file import LoopSetup, reference_of
 from softneck.fmu import build_fmu
-from softneck.loop import BlockPart, Loop, SensorFault, StepReference
+from softneck.loop import BlockPart, Loop, SensorFault
 
 from ..importers import need
+from ..references import StepReference
 from ._foreign import build_foreign
 
 MASTERS = Path(__file__).with_name("masters")

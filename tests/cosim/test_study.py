@@ -30,7 +30,6 @@ from softneck.cosim import (
 from softneck.cosim.loops._loop_table import loop_table
 from softneck.cosim.studies._run_study import failed_row
 from softneck.cosim.studies._store import Store, read_study_description, write_worst
-from softneck.loop import StepReference
 from softneck.loop._faults import make_fault
 from softneck.loop._result import metric_names
 from softneck.report import study_page
@@ -38,6 +37,7 @@ from softneck.robot import Robot
 from softneck.robot._file import preset_text
 from softneck.runtime import Port
 
+from ..references import StepReference
 from .study_parts import Gain, Lag
 
 LOOP = """

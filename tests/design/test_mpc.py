@@ -17,11 +17,12 @@ from softneck.design.plants._uncertain import uncertain_plant
 from softneck.design.predictive import _mpc_state_runtime as rt
 from softneck.design.predictive._plant import scaled_plant
 from softneck.design.predictive._settings import MpcNumbers
-from softneck.loop import BlockPart, Loop, RotationReference, run_loop
+from softneck.loop import BlockPart, Loop, run_loop
 from softneck.loop._references import AheadReference
 from softneck.runtime import load_functions, load_runtime
 
 from ..oracles.bake_off import bake_off_neck
+from ..references import RotationReference
 from .mpc_neck import GAIN, POLE, TS, Neck
 
 

@@ -89,10 +89,11 @@ def test_plans_beyond_what_the_solver_takes_are_refused() -> None:
 def test_on_a_neck_that_nobody_tuned_to_it_is_fast_and_close() -> None:
     """The defaults' promise: 0.45 s and 3 deg; 0.36 s and 2.3 deg when they were chosen."""
     from softneck.identification import FamilySettings
-    from softneck.loop import BlockPart, Loop, StepReference, metrics, run_loop
+    from softneck.loop import BlockPart, Loop, metrics, run_loop
     from softneck.signals import signal
 
     from ..foreign_necks.necks import ForeignNeck, record
+    from ..references import StepReference
 
     neck = ForeignNeck(name="spring")
     controller = MpcSettings().design(FamilySettings().fit([record(signal("eq22", duration=60.0), neck, seed=6)]))

@@ -16,11 +16,12 @@ from softneck.core import FileFormatError, SettingsError, Vector, load, read_arc
 from softneck.design import LinearController, PiSettings
 from softneck.design.linear._controller import AxisController, pi_axis
 from softneck.estimation import KalmanSettings, LinearNeck
-from softneck.loop import BlockPart, Loop, LoopResult, StepReference, metrics, run_loop
+from softneck.loop import BlockPart, Loop, LoopResult, metrics, run_loop
 from softneck.runtime import Port
 from softneck.signals import redefine
 
 from ..oracles.bake_off import exact, neck_within
+from ..references import StepReference
 from .loops import loop_margins
 
 TS = 0.02

@@ -10,9 +10,11 @@ import pytest
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings
 from softneck.identification import Model, Rls
-from softneck.loop import BlockPart, Loop, LoopResult, StepReference, run_loop
+from softneck.loop import BlockPart, Loop, LoopResult, run_loop
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import signal
+
+from ..references import StepReference
 
 TS = 0.02
 # A dropout of 0.1 s on average every 2 s.

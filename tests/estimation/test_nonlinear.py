@@ -16,7 +16,7 @@ from softneck.design import PiSettings
 from softneck.estimation import KalmanObserver, KalmanSettings, NonlinearObserver, consistency
 from softneck.estimation._offline import run_filter
 from softneck.identification import GreyBox, Model, OutputError, Play, Rls
-from softneck.loop import BlockPart, Loop, StepReference, run_loop
+from softneck.loop import BlockPart, Loop, run_loop
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
 from softneck.runtime import State
@@ -24,6 +24,7 @@ from softneck.signals import Recording, signal
 
 from ..foreign_necks.necks import ForeignNeck
 from ..foreign_necks.spoiled import errors_deg, filtered, logged, motions, moved, spoiled
+from ..references import StepReference
 from .necks import changed, jumping, neck, ramped, with_levels
 
 pytestmark = pytest.mark.usefixtures("plain_steps_of_blocks")

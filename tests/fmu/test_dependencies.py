@@ -14,10 +14,11 @@ from fmpy.fmi3 import FMU3Slave
 from fmpy.model_description import ModelDescription
 
 from softneck.fmu import build_compiled_fmu, build_fmu, unpacked
-from softneck.loop import ReferenceBlock, StepReference
+from softneck.loop import ReferenceBlock
 from softneck.runtime import Block
 
 from ..data import slow_but
+from ..references import StepReference
 from .conftest import Running
 from .every_kind import KINDS, NATIVE, TS, block_of, inputs_of
 

@@ -14,10 +14,11 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it has n
 
 from softneck.fmu import build_compiled_fmu, build_fmu
 from softneck.fmu.describe._description import TERMINALS, terminals
-from softneck.loop import ReferenceBlock, StepReference
+from softneck.loop import ReferenceBlock
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block
 
+from ..references import StepReference
 from .every_kind import TS, block_of
 
 SCHEMAS = Path(fmpy.__file__).parent / "schema" / "fmi3"

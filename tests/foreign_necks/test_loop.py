@@ -10,9 +10,10 @@ import pytest
 
 from softneck.design import PiSettings
 from softneck.estimation import LinearNeck
-from softneck.loop import BlockPart, Loop, StepReference, run_loop
+from softneck.loop import BlockPart, Loop, run_loop
 from softneck.signals import SAMPLE_TIME
 
+from ..references import StepReference
 from .necks import NECKS, ForeignNeck
 
 

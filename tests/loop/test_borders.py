@@ -16,12 +16,8 @@ from softneck.loop import (
     LoopRun,
     MotorFault,
     NeckFault,
-    RampReference,
     RecordingReference,
-    RotationReference,
     SensorFault,
-    SineReference,
-    StepReference,
     check_limits,
     metrics,
     run_loop,
@@ -32,6 +28,7 @@ from softneck.loop._faults_runtime import faults_act
 from softneck.loop._references import make_reference, reference_keys, same_quantity
 from softneck.runtime import Port
 
+from ..references import RampReference, RotationReference, SineReference, StepReference
 from ._parts import SETPOINTS, FunctionPart, lag_plant, ports
 
 TS = 0.02

@@ -20,21 +20,14 @@ from numba.core.types.functions import BaseFunction
 from softneck.core import DataError, Vector
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
-from softneck.loop import (
-    BlockPart,
-    Loop,
-    ReferenceBlock,
-    RotationReference,
-    SensorFault,
-    StepReference,
-    run_loop,
-)
+from softneck.loop import BlockPart, Loop, ReferenceBlock, SensorFault, run_loop
 from softneck.loop._faults import FAULT_KINDS, make_fault
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block, State, _compile, _numba_inner
 from softneck.runtime._own import OwnStep, own_runtime
 
 from ..data import with_starts
+from ..references import RotationReference, StepReference
 
 _KEYS: dict[str, dict[str, Any]] = {
     "sensor_bias": {"size_deg": 2.0}, "sensor_outlier": {"size_deg": 5.0, "share": 0.2, "seed": 3},

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.loop import Fault, Loop, LoopResult, MotorFault, NeckFault, SensorFault, SineReference, run_loop
+from softneck.loop import Fault, Loop, LoopResult, MotorFault, NeckFault, SensorFault, run_loop
 from softneck.loop._disturbed_bus import ActiveFault, _normal_rows, sensor_outputs
 from softneck.loop._faults import FAULT_KINDS, make_fault
 from softneck.robot import Robot
 from softneck.runtime import Port
 
+from ..references import SineReference
 from ._parts import SETPOINTS, FunctionPart, lag_plant, p_controller, ports, relay_observer
 
 TS = 0.02

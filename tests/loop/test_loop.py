@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError, Vector
-from softneck.loop import Loop, StepReference, run_loop
+from softneck.loop import Loop, run_loop
 from softneck.runtime import Port
 
+from ..references import StepReference
 from ._parts import POSITIONS, SETPOINTS, FunctionPart, lag_plant, p_controller, ports, relay_observer
 
 STEP = StepReference(pitch=0.2, roll=-0.1, at=0.1)

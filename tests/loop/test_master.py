@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.loop import Loop, StepReference, run_loop
+from softneck.loop import Loop, run_loop
 from softneck.loop._run import LoopStep
 from softneck.runtime import Port
 
+from ..references import StepReference
 from ._parts import FunctionPart, lag_plant, p_controller, ports
 
 STEP = StepReference(pitch=0.2, roll=-0.1, at=0.1)

@@ -6,16 +6,10 @@ import numpy as np
 import pytest
 
 from softneck.core import SettingsError
-from softneck.loop import (
-    RampReference,
-    RecordingReference,
-    Reference,
-    ReferenceBlock,
-    RotationReference,
-    SineReference,
-    StepReference,
-)
+from softneck.loop import RecordingReference, Reference, ReferenceBlock
 from softneck.runtime import load_runtime
+
+from ..references import RampReference, RotationReference, SineReference, StepReference
 
 EVERY: dict[str, Reference] = {
     "step": StepReference(pitch=0.2, roll=-0.1, cocontraction=0.4, at=0.3),

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.loop import RampReference, RecordingReference, RotationReference, SineReference, StepReference
+from softneck.loop import RecordingReference
 from softneck.loop._references import make_reference
+
+from ..references import RampReference, RotationReference, SineReference, StepReference
 
 
 def test_a_step_is_on_at_the_sample_it_names() -> None:

@@ -29,6 +29,7 @@ from small_blocks import (
     make,
     makers,
     recording,
+    reference_of,
     starts_of,
 )  # fmt: skip
 
@@ -107,7 +108,7 @@ def loop_run(folder: Path, *, compiled: bool = False, order: str = "sequential",
     blocks: dict[str, Any] = {role: loop.BlockPart(block_of(name, folder)) for role, name in parts.items()}
     made = loop.Loop(
         **blocks, order=order,
-        reference=loop.StepReference(pitch=0.2, roll=-0.1, at=0.1), duration=1.5, faults=tuple(faults),
+        reference=reference_of("step", pitch=0.2, roll=-0.1, at=0.1), duration=1.5, faults=tuple(faults),
     )  # fmt: skip
     with loop.LoopRun(made, compiled=compiled) as run:
         run.advance()
@@ -117,17 +118,16 @@ def loop_run(folder: Path, *, compiled: bool = False, order: str = "sequential",
 def study_run(folder: Path) -> np.ndarray:
     """Return the numbers of a small study of a model, its filter and a controller."""
     from softneck.cosim import study
-    from softneck.loop import StepReference
 
     load = find("core:load")
     files = {"plant": "rls", "observer": "kalman", "controller": "pi"}
     loop = {"duration_s": 1.0, **{role: load(folder / f"{name}.npz") for role, name in files.items()}}
     vary = {
-        "reference": {"grid": {"small": StepReference(pitch=0.05), "large": StepReference(pitch=0.2)}},
+        "reference": {"grid": {"small": reference_of("step", pitch=0.05), "large": reference_of("step", pitch=0.2)}},
         "plant.parameters.noise_std": {"log_uniform": [1e-4, 1e-2]},
         "plant.parameters.noise_seed": {"seed": True},
     }
-    runs: Any = study(loop | {"reference": StepReference(pitch=0.1)}, vary=vary, runs=8, workers=0)
+    runs: Any = study(loop | {"reference": reference_of("step", pitch=0.1)}, vary=vary, runs=8, workers=0)
     if runs["error"].any():
         raise RuntimeError(f"a run of the study failed: {runs['error'].max()}")
     return runs.select_dtypes("number").drop(columns="seconds").to_numpy(dtype=float)

@@ -9,7 +9,7 @@ from statistics import median
 from typing import Any, Protocol
 
 from softneck.core import SettingsError, SoftneckError, require_between, require_one_of
-from softneck.loop import BlockPart, Loop, LoopResult, Part, StepReference, metrics, run_loop
+from softneck.loop import BlockPart, Loop, LoopResult, Part, RobotReference, metrics, run_loop
 from softneck.loop._loop import ORDERS
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block
@@ -244,5 +244,5 @@ class _Step:
 
     def __call__(self, time: float, /) -> tuple[float, float, float]:
         """Return the reference at `time` [s]."""
-        step = StepReference(pitch=self.pitch, roll=self.roll, at=self.at)(time)
+        step = RobotReference(kind="step", values=(self.pitch, self.roll), at=self.at)(time)
         return step[0], step[1], self.cocontraction

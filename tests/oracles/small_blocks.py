@@ -95,9 +95,16 @@ def make(folder: Path) -> None:
         made[name].save(folder / f"{name}.npz", force=True)
 
 
+def reference_of(kind: str, **values: float) -> Any:
+    """Return a reference of the neck; versions before 0.3 have a name for each kind."""
+    loop = importlib.import_module("softneck.loop")
+    old = getattr(loop, f"{kind.title()}Reference", None)
+    return old(**values) if old else importlib.import_module("softneck.loop._references").reference(kind, values)
+
+
 def block_of(name: str, folder: Path) -> Any:
     """Return the block of a file or of what has none; None of a file that nothing steps."""
-    from softneck.loop import ReferenceBlock, RotationReference
+    from softneck.loop import ReferenceBlock
     from softneck.plant import NeckParameters, VirtualNeck
 
     if name == "neck":
@@ -105,7 +112,7 @@ def block_of(name: str, folder: Path) -> Any:
     if name == "lab_neck":
         return VirtualNeck(NeckParameters.lab().replace(dropout_rate=1.0)).block(noise_seed=4)
     if name == "reference":
-        return ReferenceBlock(RotationReference(inclination=0.2, at=0.1)).block()
+        return ReferenceBlock(reference_of("rotation", inclination=0.2, at=0.1)).block()
     thing = find("core:load")(folder / f"{name}.npz")
     return thing.block() if hasattr(thing, "block") else None
 

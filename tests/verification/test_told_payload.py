@@ -13,10 +13,12 @@ import pytest
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.identification import GreyBox
-from softneck.loop import BlockPart, Loop, StepReference, run_loop
+from softneck.loop import BlockPart, Loop, run_loop
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
 from softneck.verification import make_requirements, verify
+
+from ..references import StepReference
 
 TS, POLE, GAIN = 0.02, 5.3, math.radians(5.5)
 

@@ -24,7 +24,7 @@ from softneck.core import (
 )
 from softneck.cosim import load_loop, simulate
 from softneck.design import LinearController
-from softneck.loop import BlockPart, Loop, StepReference, run_loop
+from softneck.loop import BlockPart, Loop, run_loop
 from softneck.robot import Robot
 from softneck.verification import (
     Verification,
@@ -41,6 +41,7 @@ from softneck.verification._plants import all_plants, source_of_family
 from softneck.verification._steps import StepTest, run_steps
 
 from ..browser import shown
+from ..references import StepReference
 from .necks import QUICK, TS, family, linear_neck, pi
 
 QUICK_TOML = """version = 1
