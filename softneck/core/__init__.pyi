@@ -79,6 +79,7 @@ from ._files import write_text as write_text
 from ._kinds import fitting as fitting
 from ._kinds import kinds_of as kinds_of
 from ._kinds import make_settings as make_settings
+from ._kinds import toml_value as toml_value
 from ._metrics import METRICS as METRICS
 from ._metrics import metric_of as metric_of
 from ._metrics import unit_of_metric as unit_of_metric

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -164,6 +165,14 @@ def find_kind(name: str, role: str) -> Kind:
             f"unknown kind of {role} `{name}`; {did_you_mean(str(name), known)}use one of {', '.join(known)}."
         )
     return kind
+
+
+def toml_value(text: str) -> Any:
+    """Read a value as TOML does (number, true, [list]); anything else is a string."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
 
 
 def make_settings(settings_class: type, values: Mapping[str, Any]) -> Any:

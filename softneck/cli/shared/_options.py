@@ -6,14 +6,13 @@ import dataclasses
 import inspect
 import math
 import re
-import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
-from softneck.core import KINDS, DataError, SettingsError, kinds_of, make_settings, resolve, to_si
+from softneck.core import KINDS, DataError, SettingsError, kinds_of, make_settings, resolve, to_si, toml_value
 
 COMMON = {
     "robot": click.option(
@@ -106,7 +105,7 @@ def apply_settings(settings_class: type, assignments: Sequence[str], **more: Any
         key, separator, text = assignment.partition("=")
         if not separator:
             raise SettingsError(f"--set takes KEY=VALUE; got `{assignment}`.")
-        name, value = in_si(key.strip(), value_of(text.strip()), fields)
+        name, value = in_si(key.strip(), toml_value(text.strip()), fields)
         values[name] = value
     values |= {key: value for key, value in more.items() if value is not None and key in fields}
     return make_settings(settings_class, values)
@@ -157,18 +156,10 @@ def in_si(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
 
 def sample_time_of(text: str, option: str) -> float:
     """Return the sample time [s] of an option."""
-    value = value_of(text)
+    value = toml_value(text)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
         raise SettingsError(f"{option} takes a sample time in seconds, such as 0.02; got `{text}`.")
     return float(value)
-
-
-def value_of(text: str) -> Any:
-    """Read a value as TOML does (number, true, [list]); anything else is a string."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
 
 
 # `name, other: text` at the indent of an attribute; what goes on is indented deeper.

@@ -5,12 +5,10 @@ Which of them a real drive has is only known on hardware; the master must work w
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
-from softneck.core import SettingsError, require_between, require_one_of, require_whole
+from softneck.core import SettingsError, make_settings, require_between, require_one_of, require_whole, toml_value
 
 from ._sdo import WRONG_STATE, WRONG_VALUE
 
@@ -62,18 +60,5 @@ def quirks_of(texts: Sequence[str]) -> DriveQuirks:
 
     Raises SettingsError: an unknown quirk, or a value of another type.
     """
-    defaults = {field.name: field.default for field in fields(DriveQuirks)}
-    given: dict[str, Any] = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        require_one_of("quirk", name, tuple(defaults))
-        try:
-            told = tomllib.loads(f"value = {value}")["value"]
-        except tomllib.TOMLDecodeError:
-            told = value  # a word without quotes
-        told = tuple(told) if isinstance(told, list) else told
-        told = float(told) if isinstance(defaults[name], float) and type(told) is int else told
-        if type(told) is not type(defaults[name]):
-            raise SettingsError(f"`{name}` takes a value such as {defaults[name]}; got `{value}`.")
-        given[name] = told
-    return DriveQuirks(**given)
+    named = ((name, toml_value(value)) for name, _, value in (text.partition("=") for text in texts))
+    return make_settings(DriveQuirks, {name: tuple(v) if isinstance(v, list) else v for name, v in named})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -175,18 +176,18 @@ def low_pass(values: Vector, ratio: float) -> Vector:
     at it. Both ends are continued by point reflection, which keeps straight lines straight. Missed samples are bridged
     for the filter and stay missed.
     """
+    from scipy.signal import firwin, kaiserord
+
     present = np.isfinite(values)
     if values.size < 3 or present.sum() < 2:
         return values
-    stop = np.pi / ratio
-    width = (1.0 - _PASSBAND) * stop
+    taps, beta = kaiserord(_ATTENUATION_DB, (1.0 - _PASSBAND) / ratio)
     # A run shorter than the window gets a shorter window, whose edge is less steep.
-    half = min(int(np.ceil((_ATTENUATION_DB - 7.95) / (2.285 * width) / 2.0)), values.size - 1)
-    k = np.arange(-half, half + 1)
-    weights = np.sinc((stop - width / 2.0) / np.pi * k) * np.kaiser(2 * half + 1, 0.1102 * (_ATTENUATION_DB - 8.7))
+    half = min(taps // 2, values.size - 1)
+    window: Any = ("kaiser", beta)
+    weights = np.asarray(firwin(2 * half + 1, 0.5 * (1.0 + _PASSBAND) / ratio, window=window), dtype=np.float64)
     whole = np.interp(np.arange(values.size), np.flatnonzero(present), values[present])
-    ends = 2.0 * whole[0] - whole[half:0:-1], 2.0 * whole[-1] - whole[-2 : -half - 2 : -1]
-    filtered = np.convolve(np.concatenate([ends[0], whole, ends[1]]), weights / weights.sum(), mode="valid")
+    filtered = np.convolve(np.pad(whole, half, mode="reflect", reflect_type="odd"), weights, mode="valid")
     return np.where(present, filtered, np.nan)
 
 
