@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 from numpy.typing import ArrayLike
 
 from softneck.core import Matrix, SettingsError, Vector, to_si, write_text
@@ -38,22 +39,6 @@ def plant():
         sample_time={sample_time!r},{more}
     )
 '''
-_LOOP_TEMPLATE = """# Written by `softneck verify`: {title}.
-# Run it with `softneck simulate {name}`.
-duration_s = {duration:g}
-sample_time_s = {sample_time!r}
-order = "{order}"
-
-[plant]
-{plant}
-parameters = {{ {parameters} }}
-{observer}
-[controller]
-file = {controller}
-
-[reference]
-{wanted}
-"""
 
 
 def linear_plant(
@@ -155,17 +140,13 @@ def write_linear(
         duration += rows * Ts
         levels = np.vstack([np.tile([*around, before[-1]], (rows, 1)), [*stepped, before[-1]]])
         _write_reference(folder / f"{name}_reference.csv", robot, levels, Ts, force=force)
-        wanted = f'kind = "recording"\nfile = "{name}_reference.csv"'
+        wanted: dict[str, Any] = {"kind": "recording", "file": f"{name}_reference.csv"}
     else:
         wanted = _step(robot, asked.scale.shown(stepped), 0.0)
-    noise = f"noise_std = {asked.scale.si(step['noise_deg'])!r}"
-    text = _loop_text(
-        folder, f"{name}.toml", title=f"{name} on {worst['name']}, with a step", plant=f'python = "{module}:plant"',
-        parameters=noise, controller=controller, observer=None, wanted=wanted,
-        duration=duration, sample_time=Ts, order="sequential",
-    )  # fmt: skip
-    write_text(folder / f"{name}.toml", text, force=force)
-    return folder / f"{name}.toml"
+    loop = {"duration_s": duration, "sample_time_s": Ts, "order": "sequential"}
+    plant = {"python": f"{module}:plant", "parameters": {"noise_std": asked.scale.si(step["noise_deg"])}}
+    files = {"controller": controller}
+    return _write_loop(folder, name, f"{worst['name']}, with a step", {**loop, "plant": plant}, files, wanted, force)
 
 
 def write_neck(
@@ -174,22 +155,18 @@ def write_neck(
 ) -> Path:  # fmt: skip
     """Write `name.toml`, a loop over the virtual neck; `worst` are the certificate's facts on the run."""
     ends = [worst[f"{axis}_{error_unit(robot)[0]}"] for axis in robot.outputs.names]
-    values = {**worst["parameters"], "payload": worst["payload_kg"], "noise_seed": float(worst["seed"])}
-    text = _loop_text(
-        folder, f"{name}.toml", title=f"{name} on {worst['name']}", plant='neck = "paper"',
-        parameters=", ".join(f"{key} = {float(value)!r}" for key, value in values.items()), controller=controller,
-        observer=observer, wanted=_step(robot, ends, worst["at_s"]),
-        duration=worst["duration_s"], sample_time=worst["sample_time_s"], order=worst["order"],
-    )  # fmt: skip
-    write_text(folder / f"{name}.toml", text, force=force)
-    return folder / f"{name}.toml"
+    values = {**worst["parameters"], "payload": worst["payload_kg"], "noise_seed": worst["seed"]}
+    plant = {"neck": "paper", "parameters": {key: float(value) for key, value in values.items()}}
+    loop = {key: worst[key] for key in ("duration_s", "sample_time_s", "order")}
+    files = ({} if observer is None else {"observer": observer}) | {"controller": controller}
+    wanted = _step(robot, ends, worst["at_s"])
+    return _write_loop(folder, name, worst["name"], {**loop, "plant": plant}, files, wanted, force)
 
 
-def _step(robot: Robot, levels: Iterable[float], at: float) -> str:
+def _step(robot: Robot, levels: Iterable[float], at: float) -> dict[str, Any]:
     """Return the keys of a step from zero to levels in the display unit."""
-    unit = error_unit(robot)[0]
-    wanted = [f"{axis}_{unit} = {float(level)!r}" for axis, level in zip(robot.outputs.names, levels, strict=True)]
-    return "\n".join(['kind = "step"', *wanted, f"at_s = {at:g}"])
+    keys = [f"{axis}_{error_unit(robot)[0]}" for axis in robot.outputs.names]
+    return {"kind": "step", **dict(zip(keys, map(float, levels), strict=True)), "at_s": at}
 
 
 def _write_reference(path: Path, robot: Robot, levels: Matrix, sample_time: float, *, force: bool) -> None:
@@ -202,16 +179,15 @@ def _write_reference(path: Path, robot: Robot, levels: Matrix, sample_time: floa
     write_recording(path, Recording(time, sample_time, channels, robot=robot), force=force)
 
 
-def _loop_text(
-    folder: Path, name: str, *, title: str, controller: Path, observer: Path | None, **values: Any
-) -> str:  # fmt: skip
-    seen = "" if observer is None else f"\n[observer]\nfile = {_toml_path(observer, folder)}\n"
-    return _LOOP_TEMPLATE.format(
-        name=name, title=title.replace("\n", " "), controller=_toml_path(controller, folder), observer=seen, **values
-    )  # fmt: skip
-
-
-def _toml_path(path: Path, folder: Path) -> str:
-    """Return the path from `folder` as a TOML text."""
-    relative = Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
-    return '"' + relative.replace("\\", "\\\\").replace('"', '\\"') + '"'
+def _write_loop(
+    folder: Path, name: str, plant: str, table: Mapping[str, Any], files: Mapping[str, Path], wanted: Mapping[str, Any],
+    force: bool,
+) -> Path:  # fmt: skip
+    """Write `name.toml`: a loop's `table`, the files of its parts and its reference; `plant` names the plant."""
+    start = folder.resolve()
+    parts = {role: {"file": Path(os.path.relpath(file.resolve(), start)).as_posix()} for role, file in files.items()}
+    title = f"{name} on {plant}".replace("\n", " ")
+    head = f"# Written by `softneck verify`: {title}.\n# Run it with `softneck simulate {name}.toml`.\n"
+    path = folder / f"{name}.toml"
+    write_text(path, head + tomli_w.dumps({**table, **parts, "reference": wanted}), force=force)
+    return path
