@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import tomli_w
 
 from softneck.core import Matrix, Progress, write_text
 from softneck.cosim import Result, load_loop, simulate, simulate_fmu
@@ -135,29 +136,11 @@ def python_free_run(block: Block, recording: Recording) -> Matrix:
 # 15 deg as in the lab's own tests.
 _STEPS = {"pitch_step": (15.0, 0.0), "roll_step": (0.0, 15.0), "oblique_step": (10.6, 10.6)}
 
-_LOOP_TOML = """# Written by `softneck demo`; run it again with `softneck simulate {name}.toml`.
-duration_s = 8.0
-sample_time_s = {sample_time:g}
-
-[plant]
-fmu = "../fmus/VirtualNeck.fmu"
-parameters = {{ noise_seed = 5 }}
-
-[observer]
-fmu = "../fmus/Kalman.fmu"
-
-[controller]
-fmu = "../fmus/Pi.fmu"
-
-[reference]
-kind = "step"
-pitch_deg = {pitch}
-roll_deg = {roll}
-at_s = 1.0
-
-[limits]
-{limits}
-"""
+_PARTS = {
+    "plant": {"fmu": "../fmus/VirtualNeck.fmu", "parameters": {"noise_seed": 5}},
+    "observer": {"fmu": "../fmus/Kalman.fmu"},
+    "controller": {"fmu": "../fmus/Pi.fmu"},
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,10 +166,10 @@ def close_loops(folder: Path, *, sample_time: float, tell: Tell) -> dict[str, Re
     results: dict[str, Result] = {}
     for number, (name, (pitch, roll)) in enumerate(_STEPS.items()):
         path = folder / f"{name}.toml"
-        text = _LOOP_TOML.format(
-            name=name, sample_time=sample_time, pitch=pitch, roll=roll, limits=_limits(pitch, roll)
-        )
-        write_text(path, text, force=True)
+        step = {"kind": "step", "pitch_deg": pitch, "roll_deg": roll, "at_s": 1.0}
+        table = {"duration_s": 8.0, "sample_time_s": sample_time, **_PARTS, "reference": step}
+        head = f"# Written by `softneck demo`; run it again with `softneck simulate {name}.toml`.\n"
+        write_text(path, head + tomli_w.dumps({**table, "limits": _limits(pitch, roll)}), force=True)
 
         def progress(done: float, number: int = number, name: str = name) -> None:
             report((number + done) / len(_STEPS), name)
@@ -195,12 +178,13 @@ def close_loops(folder: Path, *, sample_time: float, tell: Tell) -> dict[str, Re
     return results
 
 
-def _limits(pitch: float, roll: float) -> str:
-    stepped = [axis for axis, size in (("pitch", pitch), ("roll", roll)) if size]
-    lines = [f'"{axis}.{metric}" = {limit}' for axis in stepped for metric, limit in default_limits.LOOP.items()]
+def _limits(pitch: float, roll: float) -> dict[str, float]:
     # An axis without a step must stay in place.
-    lines += [f'"{axis}.rms_error_deg" = 1.0' for axis, size in (("pitch", pitch), ("roll", roll)) if not size]
-    return "\n".join(lines)
+    axes = {
+        axis: default_limits.LOOP if size else {"rms_error_deg": 1.0}
+        for axis, size in (("pitch", pitch), ("roll", roll))
+    }
+    return {f"{axis}.{metric}": limit for axis, limits in axes.items() for metric, limit in limits.items()}
 
 
 def limits_of(results: Mapping[str, Result]) -> list[tuple[str, dict]]:
