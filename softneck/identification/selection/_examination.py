@@ -119,8 +119,8 @@ def what_to_record(robot: Robot) -> str:
     """Return the recording that would tell how a model of one motion does on others."""
     if has_own_tendons(robot):
         return "`softneck record mixed -o mixed.csv` is another motion: identify from both"
-    motors, outputs = ", ".join(robot.motors.names), ", ".join(robot.outputs.names)
-    return f"record steps of {motors} to other heights, held until {outputs} settle, and identify from both"
+    motors = ", ".join(robot.motors.names)
+    return f"record steps of {motors} of other sizes, each held until the robot is at rest, and identify from both"
 
 
 def examine(
