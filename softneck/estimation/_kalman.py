@@ -243,16 +243,11 @@ def gate_and_timing_lines(gate_level: float, constants: Vector, sample_time: flo
 
 def file_header(observer: Any) -> dict[str, Any]:
     """Return the file header that both kinds of observers share."""
-    block = observer.block()
     return {
-        "kind": block.kind,
+        **observer.block().in_header(),
         "form": observer.form,
-        "sample_time": observer.sample_time,
         "noise": dict(zip(observer.noise_names, observer.noise, strict=True)),
         **{name: getattr(observer, name) for name in ("sensor", "order", "gate_level")},
-        "inputs": [port.name for port in block.inputs],
-        "outputs": [port.name for port in block.outputs],
-        "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
         **observer.robot.in_header(),
     }
 

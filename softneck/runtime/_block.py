@@ -89,6 +89,16 @@ class Block(ReprMixin):
         arrays = tuple(np.ascontiguousarray(array, dtype=np.float64) for array in self.arrays)
         object.__setattr__(self, "arrays", arrays)
 
+    def in_header(self) -> dict[str, Any]:
+        """Return what the header of its file says of it."""
+        return {
+            "kind": self.kind,
+            "sample_time": self.sample_time,
+            "inputs": [port.name for port in self.inputs],
+            "outputs": [port.name for port in self.outputs],
+            "units": {port.name: port.unit for port in (*self.inputs, *self.outputs)},
+        }
+
     def initial_state(self, **parameters: float) -> State:
         """Return the state at t_0, with its outputs; `parameters` override start values by name.
 

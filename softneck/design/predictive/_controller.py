@@ -273,16 +273,11 @@ class MpcController(SteppedMixin, ReprMixin):
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the controller to one `.npz` file."""
-        block = self.block()
         header = {
-            "kind": "mpc",
-            "sample_time": self.sample_time,
+            **self.block().in_header(),
             **{name: getattr(self, name) for name in _LIMIT_NAMES},
             "order": self.order,
             "design": dict(self.design),
-            "inputs": [port.name for port in block.inputs],
-            "outputs": [port.name for port in block.outputs],
-            "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
             **self.robot.in_header(),
         }
         write_archive(path, header, dict(zip(rt.MpcArrays.names(), self.arrays, strict=True)), force=force)

@@ -314,10 +314,8 @@ class VaryingController(SteppedMixin, ReprMixin):
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the controller to one `.npz` file."""
-        block = self.block()
         header = {
-            "kind": self.kind,
-            "sample_time": self.sample_time,
+            **self.block().in_header(),
             "limits": self.limits.header(),
             "order": self.order,
             "names": list(self.arrays),
@@ -325,9 +323,6 @@ class VaryingController(SteppedMixin, ReprMixin):
             "parameters": [{k: v for k, v in asdict(_ADAPT).items() if k not in _UNSAID}],
             "lines": list(self.lines),
             "design": dict(self.design),
-            "inputs": [port.name for port in block.inputs],
-            "outputs": [port.name for port in block.outputs],
-            "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
             **self.robot.in_header(),
         }
         write_archive(path, header, self.arrays, force=force)
