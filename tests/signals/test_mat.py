@@ -224,3 +224,11 @@ def test_a_small_file_that_unpacks_to_a_huge_one(tmp_path: Path, monkeypatch: py
     savemat(tmp_path / "a.mat", {"log": np.zeros((2000, 6))}, do_compression=True)
     with pytest.raises(FileFormatError, match="a compressed variable is cut off or too large"):
         mat_arrays(tmp_path / "a.mat")
+
+
+def test_hdf5_that_matlab_did_not_write_has_arrays_of_one_dimension(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file["t"], file["u"] = np.arange(5.0), np.ones((5, 2))
+    found = mat_arrays(tmp_path / "log.h5")
+    assert {name: array.shape for name, array in found.items()} == {"t": (1, 5), "u": (2, 5)}

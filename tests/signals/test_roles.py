@@ -98,6 +98,12 @@ ROBOTS: dict[str, tuple[dict[str, Vector], list[str], list[str], list[str], str,
     "a plate that is only heated": (
         {"time_s": TIME, "heater_current_A": A, "plate_temp_degC": 20.0 + ONE, "ambient_degC": WARM},
         ["heater_current_A"], [], ["plate_temp_degC"], "A", "degC"),
+    "a plate whose heater's power is logged": (
+        {"time [s]": TIME, "power [W]": A, "temperature [degC]": 20.0 + ONE},
+        ["power [W]"], [], ["temperature [degC]"], "W", "degC"),
+    "a drive's power beside its command": (
+        {"time [s]": TIME, "motor_cmd [V]": A, "motor_power [W]": A**2, "angle [deg]": ONE},
+        ["motor_cmd [V]"], [], ["angle [deg]"], "V", "deg"),
     "pressures by words alone, a tip": (
         {"time": TIME, "pressure_1": A, "pressure_2": B, "x": BENT, "y": TURNED, "vx": np.gradient(BENT)},
         ["pressure_1", "pressure_2"], [], ["x", "y"], "1", "1"),
@@ -405,3 +411,19 @@ def test_the_most_motors_and_outputs_are_found_and_one_more_is_refused_by_their_
     assert is_of_another_robot(nine)
     with pytest.raises(DataError, match=r"1 to 8.*Name fewer: --motor COL"):
         guess_robot(nine)
+
+
+def test_messages_of_several_clocks_are_merged_for_any_robot(tmp_path: Path) -> None:
+    """Outputs before the first set-point were an error, as the rows of a bag were taken for those of a table."""
+    n = TIME.size
+    time = np.sort(np.concatenate([TIME + 0.001, TIME]))
+    cells = np.full((2 * n, 3), np.nan)
+    cells[0::2, 2], cells[3::4, 0], cells[3::4, 1] = ONE, A[1::2], B[1::2]
+    rows = [",".join("" if np.isnan(v) else f"{v:.6g}" for v in (t, *row)) for t, row in zip(time, cells, strict=True)]
+    (tmp_path / "bag.csv").write_text("time [s],p1_cmd [bar],p2_cmd [bar],height [mm]\n" + "\n".join(rows) + "\n")
+    guess = guess_robot(tmp_path / "bag.csv")
+    assert guess.layout.merge
+    found = import_log(tmp_path / "bag.csv", guess.layout).recording
+    # The first row with a set-point before it is the second output after it.
+    np.testing.assert_allclose(found.outputs[:, 0], 1e-3 * ONE[2:], rtol=1e-5)
+    np.testing.assert_allclose(found.set_points[:, 0], 1e5 * np.repeat(A[1::2], 2)[: n - 2], rtol=1e-5)

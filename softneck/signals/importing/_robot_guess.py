@@ -124,7 +124,7 @@ def guess_robot(
     channels += zip(robot.motor_positions, roles.positions, strict=False)  # of no motor or of all
     layout, of_clock = _layout(path, table, robot, channels, roles, sample_time)
     if clock is not None:
-        layout = replace(clock[0], channels=layout.channels, run=roles.run, robot=robot)
+        layout = replace(clock[0], channels=layout.channels, run=roles.run, robot=robot, merge=layout.merge)
         of_clock = clock[2]
     taken = [f"motors: {_list(roles.motors)}{f': {roles.why}' if roles.why else ''}"]
     taken += [f"measured positions: {_list(roles.positions)}"] if roles.positions else []
@@ -356,6 +356,7 @@ def _layout(
     layout = replace(
         table.form, channels=sources, time=time, run=roles.run, robot=robot,
         sample_time=(sample_time or robot.sample_time_s) if time is None else None,
+        merge=table.form.merge and any(table.lacks(title) for name, title in channels if name in robot.set_points),
     )  # fmt: skip
     return layout, doubts
 

@@ -121,7 +121,7 @@ class _Words:
 
     @property
     def actuator(self) -> bool:
-        return self.sent or self.any(_ACTUATOR) or self.quantity == "A" or self.words == {"p"}
+        return self.sent or self.any(_ACTUATOR, _LOAD) or self.quantity in ("A", "W") or self.words == {"p"}
 
     @property
     def place(self) -> bool:

@@ -163,7 +163,9 @@ def mat_arrays(source: Path) -> dict[str, np.ndarray]:
         raise
     except Exception as error:  # the parsers raise whatever the damaged bytes lead to
         raise FileFormatError(f"{source}: cannot be read as a MAT file ({error_reason(error)}).") from error
-    return {name: array for name, array in found.items() if array.ndim == 2 and array.size}
+    # An array of HDF5 that MATLAB did not write may have one dimension.
+    found = {name: np.atleast_2d(array) for name, array in found.items() if array.size}
+    return {name: array for name, array in found.items() if array.ndim == 2}
 
 
 def _numpy_arrays(source: Path) -> dict[str, np.ndarray] | None:
