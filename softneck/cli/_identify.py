@@ -79,8 +79,6 @@ def command(
     as_json: bool,
 ) -> None:
     """Identify a model of KIND from one or more recordings."""
-    if tolerance is not None:
-        require_positive("--tolerance", tolerance)
     if old is not None:
         if html is not None or tolerance is not None:
             raise SettingsError("--from takes no --html and --tolerance: the model stays what it is.")

@@ -37,13 +37,8 @@ def new(folder: Path, loop_file: Path | None, force: bool, as_json: bool) -> Non
     """
     project = re.sub(r"[^A-Za-z0-9]+", "-", folder.resolve().name).strip("-").lower() or "neck"
     texts = _texts(project) if loop_file is None else _of_loop(loop_file, folder, project)
-    held = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
-    if held and not force:
-        more = ", ..." if len(held) > _MOST_NAMES else ""
-        raise OutputFileError(
-            f"{folder}: is not empty (it holds {', '.join(held[:_MOST_NAMES])}{more}); take a new folder, or --force "
-            "writes the project into this one and replaces files of the same names."
-        )
+    if not force:
+        _refuse_filled(folder)
     for name, text in texts.items():
         write_text(folder / name, text, force=force)
     if as_json:
@@ -134,7 +129,8 @@ def demo(output: Path | None, quick: bool, force: bool, as_json: bool) -> None:
     from softneck.report import DemoSettings, run_demo
 
     folder = output or Path("build/demo")
-    _refuse_foreign(folder, force=force)
+    if not force and not folder.resolve().is_relative_to(Path("build").resolve()):
+        _refuse_filled(folder)
     settings = DemoSettings.quick(folder) if quick else DemoSettings(out=folder)
     if quick and not as_json:
         note(f"quick: the Eq. 22 experiment is {settings.duration:g} s long, not the paper's 200 s, and trained less")
@@ -148,11 +144,13 @@ def demo(output: Path | None, quick: bool, force: bool, as_json: bool) -> None:
         raise CheckFailedError(f"a check of the demo did not hold; see {folder / 'report.html'}.")
 
 
-def _refuse_foreign(folder: Path, *, force: bool) -> None:
-    """Raise OutputError for a folder that is not empty, unless it is under build/ or `force` is set."""
-    inside = folder.resolve().is_relative_to(Path("build").resolve())
-    if not inside and not force and folder.is_dir() and any(folder.iterdir()):
-        raise OutputFileError(f"{folder}: is not empty; use --force to replace files in it or choose another folder.")
+def _refuse_filled(folder: Path) -> None:
+    if held := sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []:
+        more = ", ..." if len(held) > _MOST_NAMES else ""
+        raise OutputFileError(
+            f"{folder}: is not empty (it holds {', '.join(held[:_MOST_NAMES])}{more}); take a new folder, or --force "
+            "writes into this one and replaces files of the same names."
+        )
 
 
 def _print(demo: Demo) -> None:

@@ -91,7 +91,7 @@ def test_run_writes_a_recording(call: Call, files: Path) -> None:
     [
         (("check",), "say which drives: --bus INTERFACE:CHANNEL or --simulated"),
         (("check", "--bus", "virtual:x"), "drives on a bus need --drives DRIVES.toml"),
-        (("check", "--simulated", "--override", "luck"), "--override takes one of certificate, identity"),
+        (("check", "--simulated", "--override", "luck"), "'luck' is not one of 'certificate', 'identity'"),
         (("check", "--simulated", "--drives", "none.toml"), "none.toml: no such file"),
         (("commission", "--only", "zero", "--bus", "virtual:x", "--drives", "{example}"),
          "say --arm if they may. Nothing was sent"),

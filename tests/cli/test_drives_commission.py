@@ -95,7 +95,7 @@ def test_two_devices_with_one_number_write_nothing(
         (["--pace", "0"], "`--pace` must be between"),
         (["--log", "x.blf"], "x.blf: a log ends in .mcap."),
         (["--motor", "5"], "`--motor` must be a whole number between 1 and 3"),
-        (["--override", "all"], "--override takes one of"),
+        (["--override", "all"], "is not one of"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(

@@ -40,7 +40,7 @@ def common_options(*names: str) -> Callable[[Callable], Callable]:
 
 tolerance_option = click.option(
     "--tolerance",
-    type=float,
+    type=click.FloatRange(min=0.0, min_open=True),
     help="Error that the output `validity` allows, in the outputs' display unit; a neck's is 2 deg.",
 )
 trust_option = click.option(
