@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import re
 import sys
 import textwrap
@@ -73,17 +72,15 @@ def percent(value: float | None) -> str:
 
 # Time after which the bar appears [s].
 _DELAY_S = 2.0
-_SWITCH_VARIABLE = "SOFTNECK_PROGRESS"
 
 
 @contextmanager
 def shown_progress(what: str, given: Progress | None) -> Iterator[Progress]:
     """Yield the callback that was `given`, or one that draws a bar after two seconds.
 
-    No bar is drawn where stderr is no terminal or the variable SOFTNECK_PROGRESS is 0; `softneck.core.silent` given
-    as callback turns one bar off.
+    No bar is drawn where stderr is no terminal; `softneck.core.silent` given as callback turns one bar off.
     """
-    if given is not None or not sys.stderr.isatty() or os.environ.get(_SWITCH_VARIABLE) == "0":
+    if given is not None or not sys.stderr.isatty():
         yield given or silent
         return
     bars: list[Any] = []

@@ -53,13 +53,11 @@ def test_the_rest_takes_as_long_for_each_part_as_what_was_done_since_the_first()
     assert "0:00:50 0:00:25 left" in shown.getvalue()
 
 
-@pytest.mark.parametrize("off", ["no terminal", "variable", "silent"])
+@pytest.mark.parametrize("off", ["no terminal", "silent"])
 def test_it_can_be_turned_off(monkeypatch: pytest.MonkeyPatch, off: str) -> None:
     terminal = terminal_of(monkeypatch)
     if off == "no terminal":
         monkeypatch.setattr(terminal, "isatty", lambda: False)
-    if off == "variable":
-        monkeypatch.setenv("SOFTNECK_PROGRESS", "0")
     later(monkeypatch)
     with shown_progress("study", silent if off == "silent" else None) as tell:
         tell(0.1, "a")

@@ -46,7 +46,7 @@ _NOW = {
     "identify --refit": "softneck identify KIND REC --train 1",
     "identify --hold-out": "softneck validate MODEL --data REC",
     "identify --strategy": "a loop over `identify KIND --set` and `validate`",
-    "identify --plot": "softneck validate MODEL --data REC -o PAGE.html",
+    "identify --plot": "softneck validate MODEL --data REC --html PAGE.html",
     "demo --out": "-o",
     "design --mat": "softneck.load(CONTROLLER).to_mat(FILE) in Python",
     "doctor --compile": "softneck demo --quick",
