@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from softneck import identify
+from softneck.core import to_si
 from softneck.identification import Model
 from softneck.identification.selection._auto import choose
 from softneck.robot import Robot
@@ -148,18 +149,17 @@ def test_the_equations_of_tendons_see_the_same(changed: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("name", ["finger", "arm"])
-def test_a_system_in_the_units_of_the_robot_says_so(name: str) -> None:
+def test_a_system_is_in_si_and_has_the_names_of_the_robot(name: str) -> None:
     (seen, model), robot = fitted("rls", name, View()), PLANTS[name].robot
-    system, own = model.ss(units="robot"), model.ss()
-    motor, output = robot["motors"]["unit"], robot["outputs"]["unit"]
-    assert system.input_labels == [f"{channel} [{motor}]" for channel in seen.robot.set_points]
-    assert system.output_labels == [f"{channel} [{output}]" for channel in seen.robot.outputs.names]
-    assert own.input_labels == list(seen.robot.set_points)
+    system = model.ss()
+    assert system.input_labels == list(seen.robot.set_points)
+    assert system.output_labels == list(seen.robot.outputs.names)
     # The plant bends by 20 % at most, so that a line through it has nearly its gain.
-    gain = PLANTS[name].gain * np.array(PLANTS[name].weights)
+    (motor, _), (output, _) = to_si(robot["motors"]["unit"]), to_si(robot["outputs"]["unit"])
+    gain = output / motor * PLANTS[name].gain * np.array(PLANTS[name].weights)
     np.testing.assert_allclose(np.atleast_2d(system.dcgain()), gain, atol=0.2 * np.abs(gain).max())
     first = seen.robot.outputs.names[0]
-    by_motor = model.tf(first, input=seen.robot.set_points[0], units="robot").dcgain()
+    by_motor = model.tf(first, input=seen.robot.set_points[0]).dcgain()
     # Directions of the low-pass that learns them, beside the gains that a whole model has.
     assert by_motor == pytest.approx(np.atleast_2d(system.dcgain())[0, 0], rel=1e-6)
 
@@ -167,6 +167,6 @@ def test_a_system_in_the_units_of_the_robot_says_so(name: str) -> None:
 @pytest.mark.slow
 def test_a_linearised_model_is_in_the_same_units() -> None:
     seen, model = fitted("rls", "arm", View())
-    system = model.ss(units="robot")
-    linear = model.linearize(seen.recording.set_points.mean(axis=0), units="robot")
+    system = model.ss()
+    linear = model.linearize(seen.recording.set_points.mean(axis=0))
     np.testing.assert_allclose(linear.dcgain()[: len(system.output_labels)], system.dcgain(), rtol=1e-6)

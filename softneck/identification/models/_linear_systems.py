@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,12 +18,9 @@ if TYPE_CHECKING:
 
 KINDS = ("rls", "oe")
 STATE_SPACE = "softneck.identification.linear._state_space_runtime"
-UNITS = ("SI", "robot")
 
 
-def transfer_function(
-    model: Any, output: str, input: str | None, angle_unit: str = "rad", units: str = "SI"
-) -> control.TransferFunction:
+def transfer_function(model: Any, output: str, input: str | None, angle_unit: str = "rad") -> control.TransferFunction:
     """Return the discrete transfer function from `input` to `output`, with its exact dead time."""
     name = _checked_input(model, output, input)
     b, a, delay = _function(model, output, name)
@@ -32,37 +29,17 @@ def transfer_function(
     below, above = np.zeros(n + 1), np.zeros(n + 1)
     below[: a.size + 1] = [1.0, *a]
     above[1 + delay : 1 + delay + b.size] = b
-    return _convert_units(model, (above, below, model.sample_time), (name, output), angle_unit, units)
+    return _named(model, (above, below, model.sample_time), name, output, angle_unit)
 
 
-def _convert_units(
-    model: Any, G: tuple[Any, ...], names: tuple[str, str], angle_unit: str, units: str
-) -> control.TransferFunction:
-    """Convert a transfer function in SI to other units, with names."""
+def _named(model: Any, G: tuple[Any, ...], name: str, output: str, angle_unit: str) -> control.TransferFunction:
+    """Return a transfer function in SI, or of an angle in `angle_unit`, with the names of its signals."""
     import control
 
-    name, output = names
     require_one_of("angle_unit", angle_unit, ("rad", "deg"))
-    _, per_input, inputs = _unit_factors(model.robot, [name], units)
-    per_output, _, outputs = _unit_factors(model.robot, [output], units)
-    if angle_unit == "deg" and units == "SI" and to_si(model.robot.outputs.unit)[1] == "rad":
-        per_output = 180.0 / np.pi
-    return control.TransferFunction(
-        per_output * (per_input * G[0]), *G[1:], inputs=inputs, outputs=outputs, name=f"G_{output}"
-    )
-
-
-def _unit_factors(robot: Robot, names: Sequence[str], units: str) -> tuple[float, float, list[str]]:
-    """Return the factors of outputs in SI and of gains over an input in SI, and the names of signals.
-
-    In the robot's units the names include the unit: `pressure_setpoint [kPa]`.
-    """
-    require_one_of("units", units, UNITS)
-    if units == "SI":
-        return 1.0, 1.0, list(names)
-    shown, motor = robot.outputs.display_unit, robot.motors.unit
-    known = dict.fromkeys(robot.outputs.names, shown)
-    return 1.0 / to_si(shown)[0], to_si(motor)[0], [f"{name} [{known.get(name, motor)}]" for name in names]
+    angle = to_si(model.robot.outputs.unit)[1] == "rad"
+    per_output = 180.0 / np.pi if angle_unit == "deg" and angle else 1.0
+    return control.TransferFunction(per_output * G[0], *G[1:], inputs=[name], outputs=[output], name=f"G_{output}")
 
 
 def to_state_space(system: Any) -> Any:
@@ -90,7 +67,7 @@ def to_state_space(system: Any) -> Any:
     return control.StateSpace(A, B, C, D, system.dt, inputs=system.input_labels, outputs=system.output_labels)
 
 
-def state_space(model: Any, units: str = "SI") -> control.StateSpace:
+def state_space(model: Any) -> control.StateSpace:
     """Return one discrete state space of all outputs, over motors or redefined inputs as the model has them."""
     import control
 
@@ -105,26 +82,14 @@ def state_space(model: Any, units: str = "SI") -> control.StateSpace:
         joined: Any = control.append(*parts)
         A, B, C = np.asarray(joined.A), np.asarray(joined.B), np.asarray(joined.C)
         inputs = robot.input_names
-    return shown_system(model, (A, B, C), (inputs, robot.outputs.names), "neck" if robot.neck else "robot", units)
-
-
-def shown_system(
-    model: Any, system: tuple[Matrix, Matrix, Matrix], names: tuple[Sequence[str], Sequence[str]], name: str, units: str
-) -> control.StateSpace:
-    """Convert A, B, C in SI to a python-control system in other units, with names."""
-    import control
-
-    (A, B, C), robot = system, model.robot
-    _, per_input, inputs = _unit_factors(robot, names[0], units)
-    per_output, per_motor, outputs = _unit_factors(robot, names[1], units)
-    positions = np.isin(names[1], robot.motor_positions)  # a linearised model has these too
-    C = np.where(positions, 1.0 / per_motor, per_output)[:, None] * C
-    D = np.zeros((len(C), B.shape[1]))
-    return control.StateSpace(A, per_input * B, C, D, model.sample_time, inputs=inputs, outputs=outputs, name=name)
+    name, D = "neck" if robot.neck else "robot", np.zeros((len(C), B.shape[1]))
+    return control.StateSpace(
+        A, B, C, D, model.sample_time, inputs=list(inputs), outputs=list(robot.outputs.names), name=name
+    )
 
 
 def continuous_function(
-    model: Any, output: str, input: str | None, angle_unit: str, pade: int, units: str
+    model: Any, output: str, input: str | None, angle_unit: str, pade: int
 ) -> control.TransferFunction:
     """Return the continuous-time transfer function that a zero-order hold discretizes to the model's."""
     import control
@@ -152,7 +117,7 @@ def continuous_function(
     G = control.TransferFunction(above[0], below)
     if pade > 0 and delay > 0:
         G = G * control.TransferFunction(*control.pade(delay * model.sample_time, pade))
-    return _convert_units(model, (np.asarray(G.num[0][0]), G.den), (name, output), angle_unit, units)
+    return _named(model, (np.asarray(G.num[0][0]), G.den), name, output, angle_unit)
 
 
 def describe(model: Any) -> list[str]:
@@ -314,8 +279,10 @@ def jacobian(model: Any, state: State, inputs: ArrayLike) -> Jacobian:
     return Jacobian(X[:, :n], X[:, n:], Y[:, :n], Y[:, n:])
 
 
-def linearize(model: Any, at: State | Mapping[str, float] | ArrayLike | None, units: str) -> control.StateSpace:
+def linearize(model: Any, at: State | Mapping[str, float] | ArrayLike | None) -> control.StateSpace:
     """Linearize `model` at a state; see `Model.linearize`."""
+    import control
+
     block = model.block()
     motors = _motor_count(block)
     load_tangent(block.runtime)  # refuse a kind without derivatives before the simulation to rest
@@ -335,7 +302,8 @@ def linearize(model: Any, at: State | Mapping[str, float] | ArrayLike | None, un
     B, C = np.vstack([J.B, J.D]), np.hstack([np.zeros((n_out, n)), np.eye(n_out)])
     A, B, C = remove_unreachable_states(A, B, C)
     names = [port.name for port in block.inputs[:motors]], [port.name for port in block.outputs[:-1]]
-    return shown_system(model, (A, B, C), names, model.kind, units)
+    D = np.zeros((n_out, motors))
+    return control.StateSpace(A, B, C, D, model.sample_time, inputs=names[0], outputs=names[1], name=model.kind)
 
 
 def _set_points(block: Block, at: Mapping[str, float] | ArrayLike | None, robot: Robot) -> Vector:

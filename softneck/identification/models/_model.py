@@ -170,9 +170,7 @@ class Model(ReprMixin):
         """
         return _linear.jacobian(self, state, inputs)
 
-    def linearize(
-        self, at: State | Mapping[str, float] | ArrayLike | None = None, *, units: str = "SI"
-    ) -> control.StateSpace:
+    def linearize(self, at: State | Mapping[str, float] | ArrayLike | None = None) -> control.StateSpace:
         """Linearize the model at a state, from the motors' set-points to the outputs.
 
         States that no input reaches or that reach no output are removed. The system has `dt` and the signals' names.
@@ -180,12 +178,11 @@ class Model(ReprMixin):
         Args:
             at: the state, with set-points at its motor positions; or set-points [rad], (3,) or by name
                 (`motor_setpoint_1`, ..), under which the model is simulated to rest; None for zero.
-            units: as of `ss`.
 
         Raises:
             SettingsError: a kind without derivative, or a model that does not come to rest.
         """
-        return _linear.linearize(self, at, units)
+        return _linear.linearize(self, at)
 
     def simulate(self, recording: RecordingLike, *, motors: str = "simulated", warm_up: int = WARM_UP) -> Labelled:
         """Simulate the outputs (time, n_out) [rad] from set-points alone (free run); row 0 is the start.
@@ -283,7 +280,6 @@ class Model(ReprMixin):
         input: str | None = None,
         continuous: bool = False,
         pade: int = 3,
-        units: str = "SI",
     ) -> control.TransferFunction:
         """Return a transfer function to `output` (linear kinds); in discrete time its dead time is exact.
 
@@ -294,20 +290,14 @@ class Model(ReprMixin):
                 set-point, with the others constant; None takes the redefined input of `output` (Eq. 9, 10).
             continuous: return the continuous-time form, with a Pade approximation of the dead time.
             pade: its order; 0 leaves the dead time out.
-            units: as of `ss`.
         """
         if continuous:
-            return _linear.continuous_function(self, output, input, angle_unit, pade, units)
-        return _linear.transfer_function(self, output, input, angle_unit, units)
+            return _linear.continuous_function(self, output, input, angle_unit, pade)
+        return _linear.transfer_function(self, output, input, angle_unit)
 
-    def ss(self, *, units: str = "SI") -> control.StateSpace:
-        """Return the state space to the outputs, from the redefined inputs or the motors as the kind has them.
-
-        Args:
-            units: "SI" (rad, Pa, m, V), with the signals' names; "robot": motors in the unit of the robot's files and
-                outputs in their display unit, with units in the names: `pressure_setpoint [kPa]`, `flexion [deg]`.
-        """
-        return _linear.state_space(self, units)
+    def ss(self) -> control.StateSpace:
+        """Return the state space to the outputs in SI, from the redefined inputs or the motors as the kind has them."""
+        return _linear.state_space(self)
 
     def casadi(self) -> casadi.Function:
         """Return one step of the simulation as a CasADi function, (x, u) -> (x_next, y), from the runtime's source.
