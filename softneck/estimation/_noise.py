@@ -226,15 +226,13 @@ class Consistency(ReprMixin):
     It is chi-square for a consistent filter, with one degree of freedom for each output.
 
     Attributes:
-        level: of the bands.
         taken: number of accepted measurements.
-        inside: share of them within the band of one value; `level` is expected.
+        inside: share of them within the 95 % band of one value.
         mean: the number of outputs is expected; a larger mean shows too small a covariance.
-        mean_band: interval of `level` for the mean of independent values (Bar-Shalom 2001, sec. 5.4.2).
+        mean_band: 95 % interval for the mean of independent values (Bar-Shalom 2001, sec. 5.4.2).
         rejected: measurements that the gate rejected; 1 - `gate_level` of good ones is expected.
     """
 
-    level: float
     taken: int
     inside: float
     mean: float
@@ -245,40 +243,29 @@ class Consistency(ReprMixin):
         """Return some lines for people."""
         low, high = self.mean_band
         return (
-            f"NIS: {100 * self.inside:.1f} % of {self.taken} in the {100 * self.level:g} % band; "
+            f"NIS: {100 * self.inside:.1f} % of {self.taken} in the 95 % band; "
             f"mean {self.mean:.2f}, expected {low:.2f} to {high:.2f}\nrejected by the gate: {self.rejected}"
         )
 
 
-def consistency(
-    observer: KalmanObserver | NonlinearObserver, recording: Recording, *, level: float = 0.95, settle: int = 50
-) -> Consistency:
-    """Return the normalised innovations of a filter against their chi-square bounds.
-
-    Args:
-        observer: the filter.
-        recording: of its sample time.
-        level: of the bands.
-        settle: rows at the start of each run that are ignored.
+def consistency(observer: KalmanObserver | NonlinearObserver, recording: Recording) -> Consistency:
+    """Return the normalised innovations of a filter against their chi-square bounds, but for 50 rows of each run.
 
     Raises:
         DataError: no measurements are left, or what `observer.estimate` raises.
     """
     from scipy.stats import chi2
 
-    if not 0.0 < level < 1.0:
-        raise DataError(f"`level` must be between 0 and 1; got {level:g}.")
     estimates = observer.estimate(recording)
-    counts = np.concatenate([np.arange(len(run)) >= settle for run in recording.runs()])
+    counts = np.concatenate([np.arange(len(run)) >= SETTLE for run in recording.runs()])
     rows = np.flatnonzero(counts & estimates.judged)
     nis = estimates.innovation[rows[estimates.accepted[rows]]]
     if nis.size < 2:
-        raise DataError(f"no measurements are left after the first {settle} rows of each run; record longer.")
-    tails, degrees = np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level]), len(recording.robot.outputs.names)
+        raise DataError(f"no measurements are left after the first {SETTLE} rows of each run; record longer.")
+    tails, degrees = np.array([0.025, 0.975]), len(recording.robot.outputs.names)
     low, high = chi2.ppf(tails, degrees)
     mean_low, mean_high = chi2.ppf(tails, degrees * nis.size) / nis.size
     return Consistency(
-        level=level,
         taken=nis.size,
         inside=float(np.mean((nis >= low) & (nis <= high))),
         mean=float(np.mean(nis)),

@@ -134,9 +134,7 @@ def test_too_little_data_is_refused() -> None:
         fit_noise(observer_of(), drawn(rows=100))
     record = drawn(rows=100)
     with pytest.raises(DataError, match="no measurements are left"):
-        consistency(observer_of(), record, settle=200)
-    with pytest.raises(DataError, match="`level` must be between"):
-        consistency(observer_of(), record, level=1.0)
+        consistency(observer_of(), record.rows(0, 50))
     with pytest.raises(DataError, match="sample time"):
         fit_noise(observer_of(), replace(record, time=record.time / 2, sample_time=0.01))
 
@@ -173,7 +171,7 @@ def test_consistency_counts_what_the_gate_refused() -> None:
     judged[100:110] = False
     estimates = SimpleNamespace(judged=judged, accepted=accepted & judged, innovation=np.where(accepted, 2.0, 50.0))
     filtered: Any = SimpleNamespace(estimate=lambda _: estimates)
-    found = consistency(filtered, record, settle=50)
+    found = consistency(filtered, record)
     # 150 rows but for ten without a measurement, three of ten of them refused; a refused one has no part in the mean.
     assert (found.rejected, found.taken, found.mean, found.inside) == (42, 98, 2.0, 1.0)
 

@@ -113,7 +113,7 @@ def test_it_filters_noise_and_its_innovations_are_as_large_as_it_says() -> None:
     record = recording(model, rows=1520)
     error = observer.estimate(record).outputs - record.outputs
     assert error[200:].std() < 0.35 * 1e-4
-    found = consistency(observer, record, settle=200)
+    found = consistency(observer, record)
     low, high = found.mean_band
     assert low < found.mean < high
     assert math.isclose(0.5 * (low + high), 3.0, rel_tol=0.01)
