@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -80,18 +79,17 @@ def command(
     """Record SIGNAL on the virtual neck or robot."""
     signals.recording_suffix(output)
     refuse_existing(output, force=force)
-    bounds = {"position": max_position}
     if Path(signal_name).suffix.lower() == ".npz":
         duration = 60.0 if duration is None else duration
         record_next(
-            Path(signal_name), output, duration=duration, seed=seed, limits=bounds, robot=robot, force=force,
+            Path(signal_name), output, duration=duration, seed=seed, position=max_position, robot=robot, force=force,
             as_json=as_json,
         )  # fmt: skip
         return
     require_between("--payload", payload, 0.0, 1.0, "kg")
     whose = find_robot(robot, beside=output)
     virtual = plant.VirtualNeck.of(whose, None if neck is None else plant.NeckParameters.preset(neck))
-    given = {name: value for name, value in bounds.items() if value is not None}
+    given = {} if max_position is None else {"position": max_position}
     limits = signals.SetPointLimits(**_robot_limits(whose) | given)
     experiment = {"amplitude": amplitude, "band": _band(band)}
     asked = {name: value for name, value in experiment.items() if value is not None}
@@ -166,13 +164,13 @@ def _robot_limits(robot: Robot) -> dict[str, float]:
 
 
 def record_next(
-    source: Path, output: Path, *, duration: float, seed: int, limits: Mapping[str, float | None], robot: str | None,
+    source: Path, output: Path, *, duration: float, seed: int, position: float | None, robot: str | None,
     force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Write the set-points of the next recording, with the outputs that the model expects."""
     known = _load_known(source, robot)
     with progress("next experiment", quiet=as_json) as report:
-        bounds = identification.Bounds.of(known.robot, _limits(known.robot, limits))
+        bounds = identification.Bounds.of(known.robot, _limits(known.robot, position))
         found = identification.next_experiment(known, duration=duration, seed=seed, bounds=bounds, progress=report)
     signals.write_recording(output, found.recording, force=force)
     facts = {
@@ -204,9 +202,8 @@ def _load_known(source: Path, robot: str | None) -> identification.Known:
     return identification.Known.of_model(model)
 
 
-def _limits(robot: Robot, given: Mapping[str, float | None]) -> signals.SetPointLimits:
+def _limits(robot: Robot, position: float | None) -> signals.SetPointLimits:
     """Return the required limits, within those of the robot's drives if it names any."""
     if robot.drives is not None and robot.folder is not None:
-        return drives.drive_limits(drives.load_drives(robot.folder / robot.drives), **given)
-    asked = {name: value for name, value in given.items() if value is not None}
-    return signals.SetPointLimits(**{"position": float("inf"), **asked})
+        return drives.drive_limits(drives.load_drives(robot.folder / robot.drives), position=position)
+    return signals.SetPointLimits(position=float("inf") if position is None else position)

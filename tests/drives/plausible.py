@@ -115,7 +115,7 @@ def experiments(neck: NeckParameters | None, payload: float) -> list[Motion]:
         bench.run.watches = (log,)
         bench.pilot.wanted = (0.0, 0.0, 0.0)
         bench.pass_time(2.0)
-        limits = drive_limits(default_drives(), position=position, speed=speed)
+        limits = replace(drive_limits(default_drives(), position=position), speed=speed)
         played, _ = prepare(signal(name, duration=seconds, seed=seed), limits, ramp_s=2.0)
         rows, begin = np.asarray(played.set_points), bench.pilot.steps
         bench.pilot.act = lambda _, b=bench, P=rows, k=begin: tuple(P[min(len(P) - 1, b.pilot.steps - k - 1)])

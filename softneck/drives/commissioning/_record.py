@@ -80,30 +80,20 @@ class ExperimentResult:
         return {"completed": self.completed, "rows": self.rows, "planned_rows": self.planned, **self.ended.table()}
 
 
-def drive_limits(
-    file: DrivesFile, *, position: float | None = None, speed: float | None = None, slack: float | None = None
-) -> SetPointLimits:
-    """Return limits for a signal within those of the drives file; those of the file where none are given.
-
-    Raises SettingsError: beyond the drives file.
-    """
+def drive_limits(file: DrivesFile, *, position: float | None = None) -> SetPointLimits:
+    """Return limits for a signal within those of the drives file; raise SettingsError for a position beyond it."""
     # One number for all motors here; what each of them may do beyond its own range is clipped by `Experiment`.
     farthest = max(max(-low, high) for low, high, _ in file.ranges)
     slowest = min(fastest for _, _, fastest in file.ranges)
     whose = "[limits] in the drives file" if file.robot is None else "[limits] in the drives file, or of the robot"
-    for name, value, most, unit in (
-        ("--max-position", position, farthest, "rad"),
-        ("speed", speed, slowest, "rad/s"),
-        ("slack", slack, farthest, "rad"),
-    ):
-        if value is not None and value > most:
-            raise SettingsError(f"{name} {value:g} is beyond the {most:g} {unit} of {whose}.")
+    if position is not None and position > farthest:
+        raise SettingsError(f"--max-position {position:g} is beyond the {farthest:g} rad of {whose}.")
     return SetPointLimits(
         position=farthest if position is None else position,
         # A quarter of what the drives take: with their current limit the motors follow the quickest signals up to
         # there: Eq. 22 leaves the paper's motors 1.5 rad behind for 0.28 s at a third, for 0.04 s at a quarter.
-        speed=slowest / 4.0 if speed is None else speed,
-        slack=min(file.limits.slack_unwind, farthest, _SLACK_RAD) if slack is None else slack,
+        speed=slowest / 4.0,
+        slack=min(file.limits.slack_unwind, farthest, _SLACK_RAD),
     )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, ReprMixin, SettingsError, Vector, require_between, require_one_of, to_si
+from softneck.core import DataError, Matrix, ReprMixin, SettingsError, Vector, require_one_of, to_si
 from softneck.robot import Robot
 from softneck.signals import Recording, RecordingLike, concatenate, open_recording
 
@@ -79,18 +79,14 @@ class FrequencyResponse(ReprMixin):
         diagonal = np.einsum("kaa->ka", self.covariance).real
         return diagonal.reshape(self.response.shape)
 
-    def radius(self, confidence: float = 0.95) -> Vector:
-        """Return (k, m, q): the radius of each entry's circle about `response` at that confidence.
+    def radius(self) -> Vector:
+        """Return (k, m, q): the radius of each entry's 95 % circle about `response`.
 
         `|error|^2 / variance` has an F distribution of 2 and 2 `freedom` degrees (Pintelon and Schoukens 2012, 2.4).
-
-        Raises:
-            SettingsError: a confidence outside 0 to 1.
         """
         from scipy.stats import f
 
-        require_between("confidence", confidence, 0.01, 0.9999)
-        factor = np.asarray(f.ppf(confidence, 2, 2.0 * np.maximum(self.freedom, 1e-9)))
+        factor = np.asarray(f.ppf(0.95, 2, 2.0 * np.maximum(self.freedom, 1e-9)))
         return np.sqrt(self.variance() * factor[:, None, None])
 
     def supported(self, output: str, source: str) -> np.ndarray:

@@ -256,8 +256,6 @@ def test_bad_input_is_named() -> None:
         frequency_response([])
     with pytest.raises(SettingsError, match=r"`band` must rise within .* a quarter of the sampling rate; got 5,2"):
         multisine_experiments(band=(5.0, 2.0))
-    with pytest.raises(SettingsError, match="`confidence` must be"):
-        frequency_response(recording(u, y)).radius(1.0)
 
 
 def test_runs_are_never_joined() -> None:
