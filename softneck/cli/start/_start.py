@@ -25,6 +25,7 @@ from softneck.core import (
     require_file,
     settings_text,
 )
+from softneck.plant import has_own_tendons
 from softneck.robot import Robot, Scaling
 
 from .._import import is_terminal
@@ -37,6 +38,8 @@ from ._project_run import FILE, ProjectRun
 _PATH = click.Path(path_type=Path)
 _CERTIFICATE_FILE = "tune/best.certificate.json"
 _NEXT_RECORDING = "Record 60 s of `mixed` and start with that."
+# Of a robot that no virtual neck stands for: its own software plays the signal.
+_NEXT_STEPS = "Record steps of every motor, each held until the outputs settle, and start with that."
 _MIXED_ADVICE = (
     "in `mixed` every motor moves by itself and all move together: `softneck drives record mixed` plays it on drives"
 )
@@ -163,7 +166,7 @@ def _before(step: Step, run: ProjectRun, *, guided: bool) -> None:
     for line in lacks:
         note(line)
     if guided and lacks and not click.confirm("The recordings lack excitation. Continue?", default=True, err=True):
-        raise CheckFailedError(f"stopped by the user. {_NEXT_RECORDING}")
+        raise CheckFailedError(f"stopped by the user. {_next_recording()}")
 
 
 def _lacks(run: ProjectRun) -> list[str]:
@@ -192,13 +195,19 @@ def _with_advice(error: SoftneckError, run: ProjectRun, folder: Path, logs: tupl
         note("the models are kept: `softneck validate` and `softneck fmu` take them, and `softneck design` other kinds")
         return type(error)(_shorten(f"first controller: {said}"))
     if stage == "identification" and not between:  # the lacking excitation was printed before
-        note(_MIXED_ADVICE)
+        if (advice := _next_recording()) == _NEXT_RECORDING:
+            note(_MIXED_ADVICE)
         first = _FIRST_SENTENCE.match(said)
-        return CheckFailedError(_shorten(f"{stage}: {first[1] if first else said}", _without(said) or _NEXT_RECORDING))
+        return CheckFailedError(_shorten(f"{stage}: {first[1] if first else said}", _without(said) or advice))
     if stage == "tune":
         note(_OWN_REQUIREMENTS)
     note(f"paths are those in {folder}; fix this and run the same command again")
     return type(error)(_shorten(f"{stage}: {said}"))
+
+
+def _next_recording() -> str:
+    given = Path("robot.toml")
+    return _NEXT_STEPS if given.is_file() and not has_own_tendons(Robot.read(given)) else _NEXT_RECORDING
 
 
 def _without(said: str) -> str:

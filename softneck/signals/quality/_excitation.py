@@ -171,7 +171,7 @@ def poor_excitation(recording: Recording) -> tuple[str, ...]:
     changes = _changes(recording)
     if spans.max() >= least and changes < _FEW_CHANGES:
         problems.append(
-            f"the set-points change in {changes} rows only: a model between them is a guess. Record `mixed`."
+            f"the set-points change in {changes} rows only: a model between them is a guess. Record more levels."
         )
     outputs = recording.robot.outputs.names
     if independent_motions(recording) < min(len(outputs), len(spans)):

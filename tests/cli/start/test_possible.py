@@ -117,20 +117,25 @@ def test_what_was_left_out_fails_in_the_verdict_whatever_came_of_the_rest(
     assert re.search(re.escape(f"tune does not hold: The circle cannot be.{more}"), said.err)
 
 
+@pytest.mark.parametrize(
+    ("robot", "what"), [("neck", "Record 60 s of `mixed`"), ("finger", "Record steps of every motor, each held")]
+)
 @pytest.mark.parametrize(("why", "records"), [("30 % is the least to design on.", True), ("it has no rise.", False)])
 def test_a_log_is_asked_for_only_where_the_model_is_at_fault(
-    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, why: str, records: bool
+    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, why: str, records: bool, robot: str, what: str
 ) -> None:
     def plan(asked: Options) -> Iterator[Step]:
         yield Step(stage="identification", command=("softneck", "design", "pi"), makes=(PI,), reads=asked.logs)
 
     def refuse_design(*_: Any, **__: Any) -> None:
+        Path("robot.toml").write_text(f'extends = "{robot}"\n')
         raise SettingsError(why)
 
     monkeypatch.setattr(_start, "steps", plan)
     monkeypatch.setattr(_project_run, "_softneck", refuse_design)
     said = call("start", short, "-o", "p", "--yes")
-    assert ("Record 60 s of `mixed`" in said.err.splitlines()[-1]) == records
+    assert (what in said.err.splitlines()[-1]) == records
+    assert ("`mixed`" in said.err) == (records and robot == "neck")  # no signal for a pneumatic finger
     assert why in said.err.splitlines()[-1]
     assert said.code == (1 if records else 2)
 
