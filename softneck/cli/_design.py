@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +51,8 @@ def command(
 ) -> None:
     """Design a controller of KIND on identified linear models or a family."""
     entry = find_kind(kind, "controller")
-    path, replace = target(output, f"controllers/{kind}.npz", force=force, ending=".npz")
-    refuse_existing(path, force=replace)
+    path, overwrite = target(output, f"controllers/{kind}.npz", force=force, ending=".npz")
+    refuse_existing(path, force=overwrite)
     plants = [design.linear_plant(model, any_fit=any_fit, robot=robot) for model in models]
     asked = apply_settings(resolve(entry.settings), settings)
     if observer is not None:
@@ -60,7 +61,7 @@ def command(
         asked = asked.over(load_for_robot(observer, "observer", robot))
     with progress(f"design {kind}", quiet=as_json):
         controller = asked.design(plants[0] if len(plants) == 1 else plants)
-    controller.save(path, force=replace)
+    controller.save(path, force=overwrite)
     for model, plant in zip(models, plants, strict=True):
         if "hold_out" not in getattr(plant, "findings", {"hold_out": None}):
             note(f"warning: {model}: nothing was held out when it was identified: its fit is not known")
@@ -103,16 +104,17 @@ def observer_command(
     their bias as a state.
     """
     kind = find_kind("kalman", "observer")
-    path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
-    refuse_existing(path, force=replace)
+    path, overwrite = target(output, "observers/kalman.npz", force=force, ending=".npz")
+    refuse_existing(path, force=overwrite)
     chosen = apply_settings(resolve(kind.settings), settings)
+    recordings = [signals.read_recording(path, robot=robot) for path in data]
+    chosen, lines = _with_recorded_noise(chosen, model, robot, recordings)
     observer = estimation.design_observer(chosen, model, robot)
     told: dict[str, Any] = {}
-    lines: list[str] = []
     if data:
         named = {setting.partition("=")[0].strip() for setting in settings}
-        found, lines = _fit(observer, data, robot, named)
-        observer, fit = found.observer, found.fit
+        found, more = _fit(observer, data, recordings, named)
+        observer, fit, lines = found.observer, found.fit, [*lines, *more]
         told = {
             "fit": {
                 "rows": fit.rows,
@@ -125,7 +127,7 @@ def observer_command(
                 "what": found.kept,
             }
         }
-    observer.save(path, force=replace)
+    observer.save(path, force=overwrite)
     if as_json:
         noise = dict(zip(observer.noise_names, observer.noise, strict=True))
         summary = {"observer": str(path), "kind": observer.block().kind, "form": observer.form, "noise": noise}
@@ -134,11 +136,27 @@ def observer_command(
     click.echo("\n".join([str(path), observer.summary(), *lines]))
 
 
+def _with_recorded_noise(
+    chosen: Any, model: Path, robot: str | None, recordings: list[signals.Recording]
+) -> tuple[Any, list[str]]:
+    """Return the settings with the white noise of the recordings where neither they nor the robot's file give one.
+
+    It is the level to start the fit from; the second value holds the line that says so.
+    """
+    whose = estimation.robot_of(load_for_robot(model, "model", robot))
+    given = chosen.measurement_noise_std is not None or chosen.sensor != "paper" or whose.noise_std is not None
+    if given or not recordings:
+        return chosen, []
+    level, (factor, si) = signals.recorded_noise(recordings), to_si(whose.outputs.unit)
+    shown = f"{level / factor:.3g} {whose.outputs.unit}"
+    told = f"  the fit starts from a sensor noise of {shown}, white noise of the recordings"
+    return replace(chosen, measurement_noise_std=level if si == "rad" else level / factor), [told]
+
+
 def _fit(
-    observer: Any, data: tuple[Path, ...], robot: str | None, named: set[str]
+    observer: Any, data: tuple[Path, ...], recordings: list[signals.Recording], named: set[str]
 ) -> tuple[estimation.FittedObserver, list[str]]:
     """Fit the observer to the recordings; return it and the lines to print."""
-    recordings = [signals.read_recording(path, robot=robot) for path in data]
     found = estimation.fit_observer(observer, recordings, named)
     unit = observer.robot.outputs.display_unit
     before, after = found.fit.log_likelihood

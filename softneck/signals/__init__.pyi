@@ -47,6 +47,7 @@ from .importing.formats._mcap import LARGEST_RECORD as LARGEST_RECORD
 from .importing.formats._mcap import is_run_log as is_run_log
 from .importing.formats._mcap import require_chunks as require_chunks
 from .quality._channel_faults import check_channel as check_channel
+from .quality._channel_faults import recorded_noise as recorded_noise
 from .quality._excitation import BANDWIDTH as BANDWIDTH
 from .quality._excitation import independent_motions as independent_motions
 from .quality._excitation import poor_excitation as poor_excitation

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from softneck.core import load
 from softneck.identification import Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.signals import signal, write_recording
+from softneck.robot import Robot
+from softneck.signals import Recording, signal, write_recording
 
 from .conftest import Call
 
@@ -23,6 +27,27 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     Rls().fit([recording]).save(folder / "rls.npz")
     write_recording(folder / "rec.csv", recording)
     return folder / "rls.npz", folder / "rec.csv"
+
+
+def test_the_noise_of_a_robot_that_gives_none_is_that_of_its_recording(call: Call) -> None:
+    tank = Robot.from_dict({
+        "name": "tank", "motors": {"names": ["pump"], "unit": "V", "setpoint_min": 0.0, "setpoint_max": 5.0},
+        "outputs": {"names": ["level"], "unit": "mm"}, "directions": {"kind": "identified"},
+    })  # fmt: skip
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(0.0, 5.0, 60), 25)
+    level = 1e-3 * (20.0 * np.asarray(lfilter([0.0, 0.1], [1.0, -0.9], u)) + 0.3 * rng.standard_normal(u.size))
+    time, channels = 0.02 * np.arange(u.size), {"motor_setpoint_1": u, "level": level}
+    write_recording("rec.csv", Recording(time, 0.02, channels, robot=tank))
+    assert call("identify", "rls", "rec.csv", "-o", "rls.npz").code == 0
+    assert "gives no `sensor.noise_std`" in call("observer", "rls.npz", "-o", "o.npz").err
+    said = call("observer", "rls.npz", "-o", "o.npz", "--data", "rec.csv")
+    assert said.code == 0, said.err
+    found = re.search(r"starts from a sensor noise of ([\d.]+) mm, white noise of the recordings", said.out)
+    assert found is not None
+    # The median of 1,500 differences, of which 60 are jerks.
+    assert float(found[1]) == pytest.approx(0.3, rel=0.1)
+    assert load("o.npz").noise[0] == pytest.approx(3e-4, rel=0.1)
 
 
 def test_every_form_becomes_a_file(call: Call, files: tuple[Path, Path]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import shutil
 import tomllib
@@ -13,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 
-from softneck import signals, tuning, verification
+from softneck import tuning, verification
 from softneck.core import OutputFileError, SettingsError, to_si, write_text
 from softneck.robot import OPTIONAL_KEYS, ROBOT_KEYS, Robot
-from softneck.signals import Recording
+from softneck.signals import Recording, recorded_noise
 
 from ..shared._console import note
 
@@ -100,8 +99,6 @@ def impossible(plants: tuple[str, ...]) -> dict[str, str]:
 
 #: Value, certainty in %, reason.
 Entry = tuple[float | list[float], int, str]
-# Noise of a channel without noise, relative to its range: a sensor of 1,000 levels.
-_LEAST_NOISE_RATIO = 1e-3
 # Ends of motors' ranges that differ by less of the widest range are one end.
 _ALIKE = 0.1
 
@@ -114,7 +111,11 @@ def propose_missing(file: Path, recordings: Sequence[Recording], *, motors: bool
     robot = Robot.read(file)
     told = robot.as_dict()
     sensor = {
-        "noise_std": (_noise(robot, recordings), 80, "white noise of the recordings, by their fourth differences"),
+        "noise_std": (
+            _digits(recorded_noise(recordings) / to_si(robot.outputs.unit)[0]),
+            80,
+            "white noise of the recordings, by their fourth differences",
+        ),
         "delay_s": (0.0, 50, "recordings show only its sum with the plant's dead time; all of it counts as dead time"),
         "rate_hz": (_digits(1.0 / recordings[0].sample_time), 80, "one measurement a sample of the recordings"),
     }
@@ -187,19 +188,6 @@ def _limits(robot: Robot, recordings: Sequence[Recording]) -> dict[str, Entry]:
         "setpoint_max": (_digits(highest.max()) if alike else [*map(_digits, highest)], 70, range_why),
         "rate_limit": (_digits(max(rates) / unit), 50, f"{how} in the recordings"),
     }
-
-
-def _noise(robot: Robot, recordings: Sequence[Recording]) -> float:
-    """Return the largest noise of an output, in the unit of the robot's outputs."""
-    levels = []
-    for recording in recordings:
-        for name in robot.outputs.names:
-            channel = signals.check_channel(recording, name)
-            # A coarse sensor is as uncertain as its steps are wide, a clean one at least as a tenth of a percent.
-            steps = (channel.quantum or 0.0) / math.sqrt(12.0)
-            noise = 0.0 if math.isnan(channel.noise) else channel.noise
-            levels.append(max(noise, steps) or _LEAST_NOISE_RATIO * (channel.highest - channel.lowest))
-    return _digits(max(levels) / to_si(robot.outputs.unit)[0])
 
 
 def _digits(value: float) -> float:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +37,8 @@ _SPIKE_FLOOR = 0.02
 _MAD_TO_STD = 1.4826
 # Variance of the fourth difference of white noise: 1 + 16 + 36 + 16 + 1.
 _FOURTH_DIFFERENCE_VARIANCE = 70.0
+# Noise of a channel without noise, relative to its range: a sensor of 1,000 levels.
+_LEAST_NOISE_RATIO = 1e-3
 # Commands may hold or repeat a value without a fault of a sensor.
 _COMMAND_CHANNELS = re.compile(
     r"motor_setpoint_|.*_(setpoint|reference)$|payload|push_|base_tilt_|healthy|enabled|measurement_valid"
@@ -328,6 +331,19 @@ def _quantum(values: Vector) -> float | None:
     on_grid = np.abs(near - np.round(near)) < 0.1
     # By chance a fifth of the gaps would be this near to a multiple, and few gaps as small as the smallest.
     return step if on_grid.mean() > 0.95 and small.size > 0.1 * gaps.size else None
+
+
+def recorded_noise(recordings: Sequence[Recording]) -> float:
+    """Return the largest standard deviation of white noise on an output of recordings [SI], positive."""
+    levels = []
+    for recording in recordings:
+        for name in recording.robot.outputs.names:
+            channel = check_channel(recording, name)
+            # A coarse sensor is as uncertain as its steps are wide, a clean one at least as a tenth of a percent.
+            steps = (channel.quantum or 0.0) / math.sqrt(12.0)
+            noise = 0.0 if math.isnan(channel.noise) else channel.noise
+            levels.append(max(noise, steps) or _LEAST_NOISE_RATIO * (channel.highest - channel.lowest))
+    return max(levels)
 
 
 def _noise(y: Vector, run: np.ndarray) -> tuple[float, bool]:
