@@ -2,7 +2,13 @@
 
 import numpy as np
 
-from softneck.identification.models._bank_runtime import bank_advance, drive_advance, drive_limit, load_advance
+from softneck.identification.models._bank_runtime import (
+    bank_advance,
+    drive_advance,
+    drive_limit,
+    load_advance,
+    valve_advance,
+)
 
 
 def drive_run(drive: np.ndarray, load: np.ndarray, targets: np.ndarray, start: np.ndarray, motors: np.ndarray) -> None:
@@ -20,7 +26,10 @@ def drive_run(drive: np.ndarray, load: np.ndarray, targets: np.ndarray, start: n
         for j in range(targets.shape[1]):
             back = k + 1 - int(drive[j, 1])  # m(k+1) answers to u(k+1-d)
             target = targets[back, j] if back >= 0 else start[j]
-            m[j] = drive_advance(drive[j, 0], target, m[j], drive_limit(load, q[j], mean))
+            if load.shape[0] > 4:
+                m[j] = valve_advance(load, target, m[j])
+            else:
+                m[j] = drive_advance(drive[j, 0], target, m[j], drive_limit(load, q[j], mean))
         motors[k + 1] = m
 
 

@@ -3,7 +3,8 @@
 Drive: `m_j` moves towards its delayed set-point as a first-order lag, but no further than
 `c + c1 (q_j - mean q) + c2 mean q`, where q is m after a low-pass: a drive at its current limit stalls at a tension,
 which depends on the pose of the neck and so on m. It never moves away from its set-point.
-load = [pole of q, c, c1, c2].
+load = [pole of q, c, c1, c2]. With two numbers more, poles of a valve that fills and vents a chamber at different
+speeds, m_j is the pressure that follows its set-point, with the first pole upwards and the second downwards.
 
 Bank: each redefined input (theta, phi, delta) directly and through play operators (Visintin 1994, sec. III.2), each of
 these through `order` equal low-pass filters. The order * c * (1 + widths) signals for c redefined inputs stay between
@@ -24,6 +25,11 @@ def drive_limit(load: np.ndarray, q: float, mean: float) -> float:
 def drive_advance(pole: float, target: float, m: float, limit: float) -> float:
     """Return the motor's next position by its lag, stopped at the limit but never moved back by it."""
     return min(pole * m + (1.0 - pole) * target, max(limit, m))
+
+
+def valve_advance(load: np.ndarray, target: float, m: float) -> float:
+    """Return the next pressure of a chamber, which fills towards a higher target and vents towards a lower one."""
+    return m + (1.0 - load[4]) * max(target - m, 0.0) + (1.0 - load[5]) * min(target - m, 0.0)
 
 
 def load_advance(load: np.ndarray, m: np.ndarray, q: np.ndarray) -> None:

@@ -97,10 +97,18 @@ _MAX_ROWS = 10_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedDrive:
-    """A drive (motors, 2): pole, delay; its load limit (4,): pole of q, c, c1, c2 of `_bank_runtime` or `NO_LOAD`."""
+    """A drive (motors, 2): pole, delay; its load limit (4,): pole of q, c, c1, c2 of `_bank_runtime` or `NO_LOAD`.
+
+    Of valves the load has two numbers more, their poles while a chamber fills and while it vents.
+    """
 
     drive: Matrix
     load: Vector
+
+    def with_valves(self, poles: Vector) -> LoadedDrive:
+        """Return it with chambers that follow their set-points by these poles (2,), of filling and of venting."""
+        drive = np.tile([float(poles.mean()), 1.0], (len(self.drive), 1))
+        return LoadedDrive(drive, np.concatenate([self.load[:4], poles]))
 
     def simulate(self, set_points: Matrix, start: Vector) -> Matrix:
         """Return motor positions (time, motors) for set-points (time, motors), from `start` (motors,)."""
@@ -111,7 +119,7 @@ class LoadedDrive:
 
 def load_in_si(load: Vector, scaling: Scaling) -> Vector:
     """Convert pole of q, c, c1, c2 of scaled motors, which rest at zero or have no limit, to SI."""
-    return load * [1.0, scaling.motor_unit, 1.0, 1.0]
+    return load * [1.0, scaling.motor_unit, 1.0, 1.0, 1.0, 1.0][: load.size]
 
 
 def fit_loaded_drive(recording: Recording, *, limited: bool = True) -> LoadedDrive:

@@ -1,4 +1,4 @@
-"""Parts of kinds without output feedback: the noise model (array `echo`), and drives that stall under load.
+"""Parts of kinds without output feedback: the noise model (array `echo`), and drives that stall under load, or valves.
 
 The histories (see `_histories_runtime`) hold the outputs minus the kind's own part f, which is never fed back:
 y(k+1) = f(k+1) + sum_i echo_i (y - f)(k+1-i). In a simulation the sum decays.
@@ -6,7 +6,7 @@ y(k+1) = f(k+1) + sum_i echo_i (y - f)(k+1-i). In a simulation the sum decays.
 
 import numpy as np
 
-from softneck.identification.models._bank_runtime import drive_advance, drive_limit
+from softneck.identification.models._bank_runtime import drive_advance, drive_limit, valve_advance
 from softneck.identification.models._histories_runtime import NarxArrays, NarxState
 
 
@@ -36,5 +36,8 @@ def stalling_drives(p: NarxArrays, load: np.ndarray, q: np.ndarray, x: NarxState
         d = int(p.drive[j, 1])
         if d > 0:
             # In place of the lag of `narx_forward`, which knows no load and has moved `x.motors` on already.
-            x.motors[j] = drive_advance(p.drive[j, 0], x.u[d - 1, j], x.m[0, j], drive_limit(load, q[j], mean))
+            if load.shape[0] > 4:
+                x.motors[j] = valve_advance(load, x.u[d - 1, j], x.m[0, j])
+            else:
+                x.motors[j] = drive_advance(p.drive[j, 0], x.u[d - 1, j], x.m[0, j], drive_limit(load, q[j], mean))
             outputs[p.outputs + j] = x.motors[j]

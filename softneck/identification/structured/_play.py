@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement, product
 
@@ -14,7 +14,7 @@ from softneck.runtime import load_functions
 from softneck.signals import Recording
 
 from ..models._arrays import memory_array, within
-from ..models._drive import FUNCTIONS, NEW_MOTION_FACTOR, LoadedDrive, drive_start, fit_noise_model, load_in_si
+from ..models._drive import FUNCTIONS, NEW_MOTION_FACTOR, NO_LOAD, LoadedDrive, drive_start, fit_noise_model, load_in_si
 from ..models._fitting import SAME_EXCITATION, ScaledData, training_recording
 from ..models._linear_systems import history_array
 from ..models._model import WARM_UP, Model
@@ -222,6 +222,11 @@ _POLYNOMIAL_DEGREES = (1, 2, 3)
 RIDGE_WEIGHTS = (1e-6, 1e-4, 1e-2)
 # Of forms whose fits on the hold-out differ by less than this [points], that with the fewest terms is taken.
 _FIT_TOLERANCE_PCT = 0.1
+# Valves are taken that leave at most so much of the misfit on the hold-out. Starts of their search: rates of filling
+# and of venting, scaled, of chambers some times quicker than the robot.
+_VALVE_MISFIT, _VALVE_STARTS, _VALVE_EVALUATIONS = 0.8, ((20.0, 10.0), (10.0, 20.0)), 40
+# Form, ridge, its fit on the hold-out [%], and how many were tried.
+_Chosen = tuple[PlayStructure, float, float, int]
 # A held input is forgotten after this: the slowest filter by far is that of the load, some 1.
 _MEMORY_S = 15.0
 # f is kept within the range of the training outputs, widened by half of it to either side.
@@ -232,8 +237,9 @@ _OUTPUT_MARGIN = 0.5
 class Play:
     """Output-error model without feedback: polynomial of play operators and low-pass filters of the inputs.
 
-    theta_i, phi_i and delta_i of the simulated motors (drives that stall under load) pass play operators and
-    chains of low-pass filters; pitch and roll are ridge regressions on all of these and on products of one stage.
+    theta_i, phi_i and delta_i of the simulated motors (drives that stall under load; where no positions are logged,
+    valves whose chambers fill and vent at different speeds, if they predict better) pass play operators and chains of
+    low-pass filters; pitch and roll are ridge regressions on all of these and on products of one stage.
     What is None is chosen by the simulation over rows held out: the last fifth of each run and the fifth furthest
     from all others, or `hold_out`.
 
@@ -288,13 +294,18 @@ class Play:
         scaled = ScaledData.of(training_recording(recordings, all_motors=True))
         progress(0.0, "drives")
         drive, T = scaled.drive, scaled.directions.all_inputs(scaled.data.set_points)
-        data = Data.of(scaled.data, drive, T)
-        extra = None if hold_out is None else Data.of(scaled.scale(hold_out), drive, T)
         settings = self._scale_settings(scaled.scaling)
-        known = scaled.recording.robot.time_constant_s is not None
-        form, weight, fit, tried = settings._choose(
-            data, extra, _FILTER_RATES if known else _ALL_FILTER_RATES, progress
-        )
+        rates = _ALL_FILTER_RATES if scaled.recording.robot.time_constant_s is None else _FILTER_RATES
+
+        def simulated(drive: LoadedDrive) -> tuple[Data, Data | None]:
+            other = None if hold_out is None else Data.of(scaled.scale(hold_out), drive, T)
+            return Data.of(scaled.data, drive, T), other
+
+        chosen = settings._choose(*simulated(drive), rates, progress)
+        if not scaled.data.has_motor_positions:
+            progress(0.9, "valves")
+            drive, chosen = settings._try_valves(drive, simulated, chosen, rates)
+        data, (form, weight, fit, tried) = simulated(drive)[0], chosen
         progress(0.95, "all rows")
         arrays = _arrays(data, drive, form, weight, self.echo)
         findings = {
@@ -306,6 +317,9 @@ class Play:
             "hold_out_fit": fit,
             "tried": tried,
         }
+        if drive.load.size > NO_LOAD.size:
+            filling, venting = -scaled.recording.sample_time / np.log(drive.load[NO_LOAD.size :])
+            findings |= {"filling_s": float(filling), "venting_s": float(venting)}
         if hold_out is None and tried > 1:
             findings["remark"] = SAME_EXCITATION
         progress(1.0, "done")
@@ -316,9 +330,33 @@ class Play:
         widths = None if self.widths is None else tuple(width / scaling.motor_unit for width in self.widths)
         return replace(self, rate=None if self.rate is None else self.rate * scaling.second, widths=widths)
 
-    def _choose(
-        self, data: Data, extra: Data | None, rates: tuple[float, ...], progress: Progress
-    ) -> tuple[PlayStructure, float, float, int]:
+    def _try_valves(
+        self, drive: LoadedDrive, simulated: Callable[[LoadedDrive], tuple[Data, Data | None]], chosen: _Chosen,
+        rates: tuple[float, ...],
+    ) -> tuple[LoadedDrive, _Chosen]:  # fmt: skip
+        """Return the drive with the valves that predict best, and what is chosen behind it, if that is clearly better.
+
+        Their two poles are found by simplex searches (Nelder and Mead 1965), with the form that was chosen without.
+        """
+        from scipy.optimize import minimize
+
+        form, weight, fit, _ = chosen
+        Ts = simulated(drive)[0].sample_time
+
+        def valves(x: Vector) -> LoadedDrive:
+            return drive.with_valves(np.exp(-np.exp(np.clip(x, -3.0, 7.0)) * Ts))
+
+        options = {"maxfev": _VALVE_EVALUATIONS, "xatol": 0.02, "fatol": 0.02}
+        loss = lambda x: -scores(*simulated(valves(x)), form, (weight,))[0]  # noqa: E731
+        found = [minimize(loss, np.log(start), method="Nelder-Mead", options=options) for start in _VALVE_STARTS]
+        best = min(found, key=lambda one: one.fun)
+        if not -best.fun > fit:
+            return drive, chosen
+        again = self._choose(*simulated(valves(best.x)), rates, silent)
+        better = 100.0 - again[2] < _VALVE_MISFIT * (100.0 - fit)
+        return (valves(best.x), again) if better else (drive, chosen)
+
+    def _choose(self, data: Data, extra: Data | None, rates: tuple[float, ...], progress: Progress) -> _Chosen:
         """Return form and ridge of the best simulation on the hold-out, its fit [%], and how many were tried."""
         inputs, tilts = len(data.redefinition), min(len(data.redefinition), data.outputs.shape[1])
         forms = [

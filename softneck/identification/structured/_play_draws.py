@@ -49,7 +49,9 @@ class PlayDraws:
         settings = settings or Play()
         model = settings.fit(recording, progress=progress)
         scaled, found = ScaledData.of(training_recording(recording, all_motors=True)), model.findings
-        data = Data.of(scaled.data, scaled.drive, scaled.directions.all_inputs(scaled.data.set_points))
+        poles = model.arrays["load"][4:]
+        drive = scaled.drive.with_valves(poles) if poles.size else scaled.drive
+        data = Data.of(scaled.data, drive, scaled.directions.all_inputs(scaled.data.set_points))
         unit, second = scaled.scaling.motor_unit, scaled.scaling.second
         inputs, tilts = len(data.redefinition), min(len(data.redefinition), data.outputs.shape[1])
         widths = tuple(width / unit for width in found["widths"])
@@ -62,7 +64,7 @@ class PlayDraws:
             first = int(number[-1]) + 1
         terms, outputs, weight = data.terms(form)[good], data.outputs[good], float(found["ridge"])
         return cls(
-            model=model, scaled=scaled, scaled_arrays=_arrays(data, scaled.drive, form, weight, settings.echo),
+            model=model, scaled=scaled, scaled_arrays=_arrays(data, drive, form, weight, settings.echo),
             terms=terms, outputs=outputs, groups=np.concatenate(groups)[good], weight=weight, chains=form.chains,
             middle=ridge(terms, outputs, weight), spread=spread_of(terms, weight),
         )  # fmt: skip

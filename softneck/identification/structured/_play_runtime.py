@@ -22,7 +22,7 @@ from softneck.runtime._layout import array, cells, value
 class PlayArrays(NarxArrays):
     """The bank of operators and filters, and the polynomial over it."""
 
-    load = array("4", "where a drive stalls: pole, c, c1, c2 (see `_bank_runtime`)")
+    load = array("limits = 4 | 6", "where a drive stalls: pole, c, c1, c2; of valves two poles (see `_bank_runtime`)")
     redefinition = array("c, motors", "T of Eq. 9-11: motors to redefined inputs")
     widths = array("w", "widths of the play operators behind each redefined input [rad]")
     chain = array("2", "pole and number of the equal low-pass filters behind each operator")
