@@ -5,7 +5,8 @@
 On each neck `choose` gets 140 s of Eq. 22, the last 30 % held out. What a kind is truly worth is its worst axis of
 steps, sine and rotation in free run, trained with its defaults on the whole 140 s: from `benchmarks/baseline.py`, which
 computes what is not kept. Printed for each neck: the rank correlation (Spearman) over the kinds between the scores and
-the truth, that of the hold-out alone, and the regret: the best kind's worst axis less that of the chosen model.
+the truth, that of the hold-out alone, what `auto` expects of the chosen model on other motions, and the regret: the
+best kind's worst axis less that of the chosen model.
 Choices are kept in `build/predicts`; they are of the code that made them: use --fresh after a change.
 
 `--each`: how well the first figure that `identify KIND` prints predicts: what it expects of other motions. Each kind is
@@ -30,7 +31,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.baseline import MODELS, Job, compute, recorded, records_of_tests, training
 from softneck.identification import INFINITE, Model, SetMembership, choose, identify, validate
-from softneck.identification.selection._examination import MISSING, part_of_reference
+from softneck.identification.selection._examination import MISSING, Examination, part_of_reference
 from softneck.signals import signal
 from tests.foreign_necks.kept import keep, kept_lines
 from tests.foreign_necks.necks import CHOOSING
@@ -70,6 +71,7 @@ def chosen(neck: str, seed: int) -> dict[str, Any]:
             "scores": {one.kind: one.fit for one in choice.ranking if one.fit > float("-inf")},
             "hold_out": {one.kind: one.hold_out_fit for one in choice.ranking if one.fit > float("-inf")},
             "chosen": choice.chosen.kind,
+            "said": cast(Examination, choice.chosen.examination).findings(choice.chosen.kind, whole.robot),
             "worth": worst_axis(cast(Model, choice.chosen.model), neck, seed),
             "form": worst_axis(SetMembership(form="residual").fit(whole), neck, seed),
             "seconds": seconds,
@@ -181,7 +183,8 @@ def main() -> None:
         for job, found in compute(jobs, wanted.workers, fresh=False).items()
     }
     found = choices(wanted.necks, wanted.seed, wanted.workers, fresh=wanted.fresh)
-    print(f"\n{'neck':8} {'rho':>6} {'hold-out':>9} {'chosen':>9} {'worth':>6} {'best':>9} {'regret':>7} {'cpu s':>6}")
+    print(f"\n{'neck':8}{'rho':>7}{'hold-out':>10}{'chosen':>10}{'expected':>17}{'worth':>7}", end="")
+    print(f"{'best':>10}{'regret':>8}{'cpu s':>7}")
     rhos = []
     for neck, one in found.items():
         truth = {job.kind: fit for job, fit in truths.items() if job.neck == neck} | {OTHER_FORM: one["form"]}
@@ -190,8 +193,10 @@ def main() -> None:
         rho, held = (_rank_correlation([one[what][kind] for kind in kinds], worth) for what in ("scores", "hold_out"))
         best = max(truth, key=lambda kind: truth[kind])
         rhos.append(rho)
+        expected, low, high = (_number(one["said"][key]) for key in ("expected", "low", "high"))
+        interval = f"{expected:.1f} ({low:.0f}..{high:.0f})"
         print(
-            f"{neck:8} {rho:6.2f} {held:9.2f} {one['chosen']:>9} {one['worth']:6.1f} {best:>9} "
+            f"{neck:8} {rho:6.2f} {held:9.2f} {one['chosen']:>9} {interval:>16} {one['worth']:6.1f} {best:>9} "
             f"{truth[best] - one['worth']:7.1f} {one['seconds']:6.0f}"
         )
         print("         " + ", ".join(f"{kind} {one['scores'][kind]:.0f} ({truth[kind]:.0f})" for kind in kinds))

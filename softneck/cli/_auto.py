@@ -62,7 +62,7 @@ def identify_auto(
             model = replace(model, findings={**model.findings, "chosen": choice.why})
         if tolerance is not None:
             model = identification.with_tolerance(model, tolerance)
-        models.append(identification.with_fit(model, taken.chosen.judged, taken.examination))
+        models.append(identification.with_fit(model, taken.chosen.judged, taken.chosen.examination))
         models[-1].save(file, force=overwrite)
     for file in beside.values():
         if file not in saved:

@@ -38,10 +38,12 @@ from softneck.signals import (
 )
 
 from .models._fitting import check_training, payload_of
+from .models._left_out import folds
 from .models._model import Model
 from .models._validity import with_tolerance
 from .selection._auto import Choice, choose
-from .selection._examination import AGAIN, Examination, examine
+from .selection._examination import AGAIN, Examination, examine, shortened
+from .structured._greybox import as_found
 from .uncertainty._draws import make_draws
 from .uncertainty._family import Family
 from .uncertainty._family_fit import FamilySettings
@@ -198,7 +200,10 @@ def fit_and_validate(
     examination = None
     if why_at_rest(tail, whole) is None:
         examining = lambda done, text: progress(half + (1.0 - half) * done, text)  # noqa: E731
-        examination, model = examine(estimator, model, head, tail, examining)
+        left_out = folds(head, tail, other_excitation=False) if model.kind in AGAIN else []
+        found = as_found(estimator, model) if model.kind == "greybox" else estimator
+        short = lambda fold: shortened(found, model.kind).fit(fold.train)  # noqa: E731
+        examination, model = examine(short, model, head, tail, left_out, examining)
     held_out = validate(model, tail, horizons=(1, INFINITE))
     return with_fit(model, held_out, examination), held_out
 
@@ -221,7 +226,7 @@ def _best_kind(
         raise DataError("the kind chosen by `auto` has no model.")
     model = model if tolerance is None else with_tolerance(model, tolerance)
     model = replace(model, findings={**model.findings, "chosen": choice.why})
-    return with_fit(model, choice.chosen.judged, choice.examination)
+    return with_fit(model, choice.chosen.judged, choice.chosen.examination)
 
 
 def choose_kind(parts: Sequence[Recording], *, name: str, train: float, seed: int, progress: Progress) -> Choice:

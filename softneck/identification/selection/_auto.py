@@ -33,29 +33,16 @@ from ..models._left_out import (
     exams,
     folds,
     free_runs,
-    motions_held_out,
-    other_motion,
     samples_to_judge,
 )
 from ..models._linear_systems import KINDS as LINEAR
 from ..models._model import Model
-from ..models._validity import calibrate_validity
 from ..set_membership._set_membership import noise_si
 from ..structured._greybox import as_found
 from ..uncertainty._guarded import BASES, OF, Guarded, fitted_base
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
-from ._examination import (
-    HOLD_OUT,
-    NOT_FITTED,
-    POOR_FIT_PCT,
-    SECOND,
-    SHORT,
-    Examination,
-    Fits,
-    second_training,
-    unseen_rows,
-)
+from ._examination import HOLD_OUT, NOT_FITTED, POOR_FIT_PCT, SHORT, Examination, Fits, examine, shortened
 
 EXAM, COLD = "agreement", "cold start"
 # What is in a model file but was not found from data: sizes, tables, copies of rows in another order; and what says how
@@ -71,7 +58,7 @@ class KindTrial:
     seconds: of training; model: None where it failed; judged: on the rows held out, None where it failed or stopped
     early; left_out, errors: what was left out of a training -> fit on it and standard error over blocks of
     2 s [%] ("agreement": with the other kinds on motions that nobody recorded, without error); whole: trained on all
-    rows; outputs: what was left out -> output -> fit on it [%].
+    rows; examination: of the model of all rows.
     """
 
     kind: str
@@ -82,7 +69,7 @@ class KindTrial:
     left_out: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)
     whole: bool = True
-    outputs: Mapping[str, Fits] = field(default_factory=dict)
+    examination: Examination | None = None
 
     @property
     def scores(self) -> dict[str, float]:
@@ -198,10 +185,9 @@ def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[st
 _SIMPLE_FIRST = ("rls", "oe", "greybox", "play", "nlsm", "nn")
 # Settings other than the default: that form of set membership which can run free.
 _SETTINGS: dict[str, dict[str, Any]] = {"nlsm": {"form": "residual"}}
-# Cheaper settings of the same method, by which kinds are compared.
-_SCREENED: dict[str, dict[str, Any]] = {**SHORT, "nlsm": {"output_weight": 5.0}}
-# Of the noise: the epsilon of screened sets, whose own choice among many takes several times as long.
-_EPSILON_SIGMAS = 8.0
+# Of screened sets, whose own choice among many takes several times as long: their output weight, and their epsilon in
+# deviations of the noise.
+_SCREENED_WEIGHT, _EPSILON_SIGMAS = 5.0, 8.0
 # What a guarded form may cost on the rows held out [points]: it is taken for what it does elsewhere.
 _GUARD_COST = 2.0
 # So many kinds are trained on all rows at most, before the better of them is taken.
@@ -217,19 +203,12 @@ class Choice(ReprMixin):
         chosen: the one to take.
         why: sentences for people.
         remarks: what to be wary of.
-        other_motion: whether something left out was another motion.
     """
 
     ranking: tuple[KindTrial, ...]
     chosen: KindTrial
     why: str
     remarks: tuple[str, ...]
-    other_motion: bool = False
-
-    @property
-    def examination(self) -> Examination:
-        """What was left out, and the fits of the chosen one on it."""
-        return Examination(self.chosen.outputs, self.other_motion)
 
 
 def kinds_to_try() -> tuple[str, ...]:
@@ -276,7 +255,8 @@ def choose(
             raise DataError(
                 f"`{name}` has {samples} sample(s) in the rows held out, too few to judge by. Record longer."
             )
-    race = _Race(train, hold_out, folds(train, hold_out, other_excitation=other_excitation), seed)
+    left_out = folds(train, hold_out, other_excitation=other_excitation)
+    race = _Race(train, hold_out, left_out, seed, other_excitation=other_excitation)
     race.screen_all(wanted, lambda done, what: progress(0.7 * done, what))
     race.examine()
     best = race.train_best(lambda done, what: progress(0.7 + 0.2 * done, what))
@@ -286,7 +266,7 @@ def choose(
     alike = [one for one in ranking if one.fit > best.fit - ALIKE and one not in (best, chosen)]
     wary = (*poor_excitation(train), *_remarks(ranking, other_excitation))
     why = _explain_choice(best, alike) + _explain_guarded(best, chosen) + _explain_agreement(ranking)
-    return Choice(ranking, chosen, why, wary, other_excitation or other_motion(train))
+    return Choice(ranking, chosen, why, wary)
 
 
 def _kinds_in_order(kinds: Sequence[str]) -> list[str]:
@@ -307,11 +287,13 @@ def best_others(ranking: Sequence[KindTrial], chosen: KindTrial) -> dict[str, Ki
 class _Race:
     """The kinds of one choice: short trainings for all, a whole one for the best."""
 
-    def __init__(self, train: Recording, hold_out: Recording, left_out: list[Fold], seed: int) -> None:
-        self.train, self.hold_out, self.seed = train, hold_out, seed
+    def __init__(
+        self, train: Recording, hold_out: Recording, left_out: list[Fold], seed: int, *, other_excitation: bool = False
+    ) -> None:
+        self.train, self.hold_out, self.seed, self.other_excitation = train, hold_out, seed, other_excitation
         self.folds = left_out or [Fold(train, ())]
         self.tried: dict[str, KindTrial] = {}
-        self.short: dict[str, Model] = {}
+        self.short: dict[tuple[str, Fold], Model] = {}
         self._whole: dict[str, Model] = {}
         # Baselines of the rows held out, which are the same for all; of the exam its motions, simulations and weights.
         self._known: dict = {}
@@ -340,7 +322,7 @@ class _Race:
         """Identify a kind in its short form, and score it on the parts left out and on the hold-out."""
         fold, begin = self.folds[0], time.perf_counter()
         try:
-            model = self.short[kind] = self._short(kind, fold.train)
+            model = self._short(kind, fold)
             seconds = time.perf_counter() - begin
             found = {part.name: part.fits(model) for part in (*fold.judged, all_rows(HOLD_OUT, self.hold_out))}
         except NOT_FITTED as error:  # one kind never ends the search
@@ -367,7 +349,7 @@ class _Race:
     def _leave_out(self, kind: str, fold: Fold) -> None:
         begin = time.perf_counter()
         try:
-            model = self._short(kind, fold.train)
+            model = self._short(kind, fold)
             found = {part.name: part.fits(model) for part in fold.judged}
         except NOT_FITTED:  # one kind never ends the search
             lost = dict.fromkeys(fold.train.robot.outputs.names, float("-inf"))
@@ -422,18 +404,16 @@ class _Race:
             if bases[0] == "oe":
                 model = settings.fit(self.train, progress=progress)
             else:
-                base = fitted_base("greybox", self.train, _settings("greybox", self.seed, _SCREENED["greybox"]))
-                parts = [best.model, self.short[best.kind]]
+                base = fitted_base("greybox", self.train, _settings("greybox", self.seed, SHORT["greybox"]))
+                parts = [best.model, self._short(best.kind, self.folds[0])]
                 model = replace(settings, members=len(parts)).around(base, parts, self.train)
-            judged = self._validate("guarded", model)
+            judged, (examination, model) = self._validate("guarded", model), self._examined(best.kind, model)
         except NOT_FITTED as error:  # one kind never ends the search
             self.tried["guarded"] = KindTrial("guarded", time.perf_counter() - begin, failure=str(error))
             return best
-        fits = all_rows(HOLD_OUT, self.hold_out).fits(model)[0]
-        outputs = {**best.outputs, HOLD_OUT: fits, **self._each_held_out(model)}
-        outputs.pop(SECOND, None)  # of its kind alone: where two trainings part, the base is taken
-        one = KindTrial(
-            "guarded", time.perf_counter() - begin, model, judged, "", best.left_out, best.errors, outputs=outputs
+        seconds = time.perf_counter() - begin
+        one = replace(
+            best, kind="guarded", seconds=seconds, model=model, judged=judged, whole=True, examination=examination
         )
         self.tried["guarded"] = one
         return one if one.hold_out_fit > best.hold_out_fit - _GUARD_COST else best
@@ -448,21 +428,18 @@ class _Race:
         try:
             if one.model is None:
                 raise DataError(one.failure)
-            model = self._fitted(kind)
-            if self.folds[0].judged:
-                model = calibrate_validity(model, self.short[kind], *unseen_rows(self.folds[0]))
+            examination, model = self._examined(kind, self._fitted(kind))
             judged = self._validate(kind, model)
-            fits, error = all_rows(HOLD_OUT, self.hold_out).fits(model)
-            outputs = {**one.outputs, HOLD_OUT: fits, **self._each_held_out(model)}
-            if self.folds[0].judged:
-                outputs[SECOND] = second_training(model, self.short[kind], self.folds[0])
+            error = all_rows(HOLD_OUT, self.hold_out).fits(model)[1]
         except NOT_FITTED as error:  # one kind never ends the search
             return KindTrial(kind, one.seconds, failure=str(error))
         one = replace(one, seconds=one.seconds + time.perf_counter() - begin, errors={**one.errors, HOLD_OUT: error})
-        return replace(one, model=model, judged=judged, whole=True, outputs=outputs)
+        return replace(one, model=model, judged=judged, whole=True, examination=examination)
 
-    def _each_held_out(self, model: Model) -> dict[str, Fits]:
-        return {part.name: part.fits(model)[0] for part in motions_held_out(self.hold_out, self.train)}
+    def _examined(self, kind: str, model: Model) -> tuple[Examination, Model]:
+        """Return the examination of a model of all rows, which is of a kind or made of it, and the model after it."""
+        again, left_out = partial(self._short, kind), [fold for fold in self.folds if fold.judged]
+        return examine(again, model, self.train, self.hold_out, left_out, other_excitation=self.other_excitation)
 
     def _simplest_of_the_best(self) -> KindTrial:
         ranking = self.ranking()
@@ -478,13 +455,17 @@ class _Race:
             self._whole[kind] = _settings(kind, self.seed, {}).fit(self.train)
         return self._whole[kind]
 
-    def _short(self, kind: str, train: Recording) -> Model:
-        short = dict(_SCREENED.get(kind, {}))
-        if kind == "greybox":  # its dead time and parts are properties of the robot: known once
-            return as_found(_settings(kind, self.seed, short), self._fitted(kind)).fit(train)
-        if kind == "nlsm":
-            short["epsilon"] = _EPSILON_SIGMAS * float(noise_si(train).max())
-        return _settings(kind, self.seed, short).fit(train)
+    def _short(self, kind: str, fold: Fold) -> Model:
+        """Return the short form of a kind without what a fold leaves out, which is trained once."""
+        if (kind, fold) not in self.short:
+            settings = shortened(_settings(kind, self.seed, {}), kind)
+            if kind == "greybox":  # its dead time and parts are properties of the robot: known once
+                settings = as_found(settings, self._fitted(kind))
+            if kind == "nlsm":
+                noise = float(noise_si(fold.train).max())
+                settings = replace(settings, output_weight=_SCREENED_WEIGHT, epsilon=_EPSILON_SIGMAS * noise)
+            self.short[kind, fold] = settings.fit(fold.train)
+        return self.short[kind, fold]
 
     def _validate(self, kind: str, model: Model) -> Validation:
         rules = Rules((1, INFINITE))
@@ -494,15 +475,10 @@ class _Race:
 def _with(one: KindTrial, found: Mapping[str, tuple[Fits, float]]) -> KindTrial:
     """Return the trial with more scores, each with its standard error."""
     # A part in which no output moved says nothing of any kind.
-    outputs = {name: fits for name, (fits, _) in found.items() if not np.isnan([*fits.values()]).all()}
-    left_out = {name: float(np.nanmean([*fits.values()])) for name, fits in outputs.items()}
+    moved = {name: [*fits.values()] for name, (fits, _) in found.items() if not np.isnan([*fits.values()]).all()}
+    left_out = {name: float(np.nanmean(fits)) for name, fits in moved.items()}
     errors = {name: error for name, (_, error) in found.items() if np.isfinite(error)}
-    return replace(
-        one,
-        left_out={**one.left_out, **left_out},
-        errors={**one.errors, **errors},
-        outputs={**one.outputs, **outputs},
-    )
+    return replace(one, left_out={**one.left_out, **left_out}, errors={**one.errors, **errors})
 
 
 def _settings(kind: str, seed: int, other: Mapping[str, Any]) -> Any:

@@ -8,24 +8,23 @@ paper's tests are simulated by another kind, where one predicts what was left ou
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
-from softneck.core import KINDS, Matrix, Progress, SoftneckError, Vector, resolve, to_si
+from softneck.core import KINDS, Matrix, Progress, SoftneckError, Vector, compute_once, resolve, silent, to_si
 from softneck.plant import has_own_tendons
 from softneck.robot import Robot
 from softneck.signals import Recording
 
 from ..models._arrays import BOUNDED
 from ..models._directions import make_paper_tests
-from ..models._left_out import Fold, all_rows, exams, folds, free_runs, motions_held_out, other_motion
+from ..models._left_out import Fold, all_rows, exams, free_runs, motions_held_out, other_motion
 from ..models._model import Model
 from ..models._scores import nrmse_fit
 from ..models._validity import calibrate_validity
-from ..structured._greybox import as_found
 
 HOLD_OUT, SECOND = "hold-out", "second training"
 OF_ONE_MOTION = ("largest motions", "fastest motions", "later block", SECOND)
@@ -124,32 +123,34 @@ def what_to_record(robot: Robot) -> str:
 
 
 def examine(
-    settings: Any, model: Model, train: Recording, hold_out: Recording, progress: Progress
-) -> tuple[Examination, Model]:
-    """Examine a model that `settings` fitted to `train`; return this and the model with a validity that holds there.
+    again: Callable[[Fold], Model], model: Model, train: Recording, hold_out: Recording, left_out: Sequence[Fold],
+    progress: Progress = silent, *, other_excitation: bool = False,
+) -> tuple[Examination, Model]:  # fmt: skip
+    """Examine a model that was fitted to `train`; return this and the model with a validity that holds there.
 
-    progress: called with the part done and a word.
+    again: returns a short form of its kind, or of what it is made of, without what one of `left_out` leaves out;
+    progress: called with the part done and a word; other_excitation: whether `hold_out` is another experiment.
     """
     held_out = [all_rows(HOLD_OUT, hold_out), *motions_held_out(hold_out, train)]
     parts: dict[str, Fits] = {part.name: part.fits(model)[0] for part in held_out}
     bounds: dict[str, Any] = {}
-    left_out = folds(train, hold_out, other_excitation=False) if model.kind in AGAIN else []
-    several, reference = other_motion(train), ""
-    settings = as_found(settings, model) if model.kind == "greybox" else settings
+    several, reference = other_excitation or other_motion(train), ""
     for number, fold in enumerate(left_out):
         progress(number / len(left_out), f"without {fold.judged[0].name}")
         try:
-            again = shortened(settings, model.kind).fit(fold.train)
+            short = again(fold)
         except NOT_FITTED:  # what is left of a short recording may determine no model: the whole one stands
             continue
-        parts |= {part.name: part.fits(again)[0] for part in fold.judged}
-        if not number:
-            parts[SECOND] = second_training(model, again, fold)
+        parts |= {part.name: part.fits(short)[0] for part in fold.judged}
+        if number:
+            continue
+        if short.kind == model.kind:  # what a guarded model is made of may part where that falls back to its base
+            parts[SECOND] = second_training(model, short, fold)
             recording, rows = unseen_rows(fold)
-            model = calibrate_validity(model, again, recording, rows)
-            bounds = coverage(again, recording, rows)
-            reference, fits = ("", {}) if several else fits_to_reference(model, again, fold)
-            parts |= {part_of_reference(reference): fits} if reference else {}
+            model = calibrate_validity(model, short, recording, rows)
+            bounds = coverage(short, recording, rows)
+        reference, fits = ("", {}) if several else fits_to_reference(model, short, fold)
+        parts |= {part_of_reference(reference): fits} if reference else {}
     return Examination(parts, several, bounds, reference), model
 
 
@@ -182,8 +183,8 @@ def fits_to_reference(model: Model, again: Model, fold: Fold) -> tuple[str, Fits
         if kind == model.kind and not settings:  # the same again
             continue
         try:
-            reference = resolve(KINDS[kind].settings)(**settings).fit(fold.train)
-        except NOT_FITTED:  # a kind for other robots, or for more rows
+            reference = _fit_once(resolve(KINDS[kind].settings)(**settings), fold.train)
+        except (SoftneckError, np.linalg.LinAlgError):  # a kind for other robots, or for more rows
             continue
         known = _least_fit(reference, fold)
         if known >= POOR_FIT_PCT and 2.0 * (100.0 - known) ** 2 <= (100.0 - own) ** 2:
@@ -192,6 +193,11 @@ def fits_to_reference(model: Model, again: Model, fold: Fold) -> tuple[str, Fits
             missing = np.hypot(100.0 - fits, 100.0 - known)
             return kind, dict(zip(model.robot.outputs.names, (100.0 - missing).tolist(), strict=True))
     return "", {}
+
+
+def _fit_once(settings: Any, recording: Recording) -> Model:
+    """Return the model of a recording; of the kinds that `auto` compares each is examined by the same one."""
+    return compute_once(lambda: settings.fit(recording), settings, recording)
 
 
 def _lowest_fits(runs: Sequence[Matrix], others: Sequence[Matrix]) -> Vector:

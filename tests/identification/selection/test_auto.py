@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError, load, silent
-from softneck.identification import Choice, Model, Network, OutputError, Play, Rls, SetMembership, choose
+from softneck.identification import Choice, Model, Network, OutputError, Play, Rls, SetMembership, choose, identify
 from softneck.identification.models._arrays import members
 from softneck.identification.models._fitting import known_rows, row_hashes
-from softneck.identification.models._left_out import agreement, exams, folds, weighted_median
+from softneck.identification.models._left_out import Fold, agreement, exams, folds, weighted_median
 from softneck.identification.selection import _auto
 from softneck.identification.selection._auto import (
     ALIKE,
@@ -83,6 +83,16 @@ def test_a_kind_that_fails_is_listed_with_its_reason_and_costs_nothing_else(choi
 @pytest.mark.slow
 def test_rows_held_out_were_never_trained_on(choice: Choice) -> None:
     assert all(one.judged.rows_left_out == 0 for one in choice.ranking if one.judged is not None)
+
+
+def test_the_chosen_is_examined_as_one_kind_alone_is() -> None:
+    """What is expected of other motions does not depend on how a kind was asked for."""
+    chosen = choose(*TRAIN.split(0.7), kinds=("rls",)).chosen
+    assert chosen.model is not None
+    assert chosen.examination is not None
+    alone = identify("rls", TRAIN).findings["examination"]
+    assert chosen.examination.findings("rls", chosen.model.robot) == alone
+    assert set(alone["parts"]) > {HOLD_OUT}
 
 
 def test_a_hold_out_of_the_same_excitation_and_a_hopeless_one_are_remarked() -> None:
@@ -287,7 +297,7 @@ def race() -> _Race:
     for model, fit in ((Play().fit(TRAIN), 85.0), (OutputError(delay=0.06).fit(TRAIN), 80.0)):
         judged = race._validate(model.kind, model)
         race.tried[model.kind] = KindTrial(model.kind, 1.0, model, judged, left_out={"largest motions": fit})
-        race.short[model.kind] = model
+        race.short[model.kind, race.folds[0]] = model
     return race
 
 
@@ -333,7 +343,7 @@ def test_over_greybox_the_members_are_those_that_are_there(race: _Race, monkeypa
     assert model is not None
     held = members(model.arrays)
     assert [kind for kind, _ in held] == ["oe", "play", "play"]
-    for (_, arrays), there in zip(held[1:], (best.model, race.short["play"]), strict=True):
+    for (_, arrays), there in zip(held[1:], (best.model, race.short["play", race.folds[0]]), strict=True):
         assert all(np.array_equal(arrays[name], there.arrays[name]) for name in arrays)
     assert (model.findings["members"], model.settings["members"]) == ("2 of play", 2)
 
@@ -389,26 +399,36 @@ def racing(monkeypatch: pytest.MonkeyPatch, *, judged: int = 1, more: int = 0, f
     """Return a race whose trainings are recorded, of which those of a kind fail."""
     fitted: list[Any] = []
 
+    @dataclass(frozen=True)
     class Settings:
-        def __init__(self, kind: str, seed: int, other: Any) -> None:
-            self.told = (kind, seed, dict(other))
+        kind: str
+        seed: int
+        other: Any
+        short: bool = False
+        output_weight: float | None = None
+        epsilon: float | None = None
 
         def fit(self, recording: Any) -> Any:
-            fitted.append((*self.told, recording))
-            if self.told[0] == fails:
+            fitted.append((self, recording))
+            if self.kind == fails:
                 raise DataError("it saturates")
-            return f"{self.told[0]} of {len(recording)}"
+            return f"{self.kind} of {len(recording)}"
 
     monkeypatch.setattr(_auto, "_settings", Settings)
+    monkeypatch.setattr(_auto, "shortened", lambda settings, kind: replace(settings, short=kind == settings.kind))
     monkeypatch.setattr(_auto, "all_rows", lambda name, _: part(name, {"pitch": 90.0, "roll": 50.0}, 3.0))
     monkeypatch.setattr(_auto, "numbers_of", lambda model: len(str(model)))
     monkeypatch.setattr(_Race, "_validate", lambda *_: SimpleNamespace(fits={_auto.INFINITE: FITS}, cold_fits=FITS))
-    monkeypatch.setattr(_auto, "calibrate_validity", lambda model, short, *_: f"{model}, held by {short}")
-    monkeypatch.setattr(_auto, "unseen_rows", lambda fold: (fold,))
-    monkeypatch.setattr(_auto, "second_training", lambda *_: {"pitch": 10.0})
+
+    def examine(again: Any, model: Any, train: Any, hold_out: Any, left_out: Any, *, other_excitation: bool) -> Any:
+        """Tell what is examined, and by which short trainings."""
+        assert (train, hold_out) == (TRAIN, OTHER)
+        return ([again(fold) for fold in left_out], other_excitation), f"{model}, examined"
+
+    monkeypatch.setattr(_auto, "examine", examine)
     monkeypatch.setattr(_auto, "noise_si", lambda _: np.array([0.1, 0.2]))
-    folds: list[Any] = [SimpleNamespace(train=TRAIN.rows(0, 800), judged=tuple(map(part, "abc"[:judged])))]
-    folds += [SimpleNamespace(train=TRAIN.rows(0, 700 - k), judged=(part(f"run {k}", FITS),)) for k in range(more)]
+    folds = [Fold(TRAIN.rows(0, 800), tuple(map(part, "abc"[:judged])))]
+    folds += [Fold(TRAIN.rows(0, 700 - k), (part(f"run {k}", FITS),)) for k in range(more)]
     return _Race(TRAIN, OTHER, folds, 5), fitted
 
 
@@ -427,19 +447,19 @@ def test_a_short_training_is_scored_on_each_part_and_a_failure_costs_its_own_tim
         race.screen(kind)
     one = race.tried["rls"]
     assert (one.left_out, one.errors) == ({"a": 70.0, "b": 70.0, HOLD_OUT: 70.0}, {"a": 2.0, "b": 2.0, HOLD_OUT: 3.0})
-    assert one.outputs == {"a": FITS, "b": FITS, HOLD_OUT: {"pitch": 90.0, "roll": 50.0}}
-    assert (one.model, one.whole, one.failure, race.short["rls"]) == ("rls of 800", False, "", "rls of 800")
+    assert (one.model, one.whole, one.failure, one.examination) == ("rls of 800", False, "", None)
     failed = race.tried["oe"]
     assert (failed.model, failed.failure, failed.fit) == (None, "it saturates", float("-inf"))
     # A grey box has the parts and the dead time that all rows have, which are trained on once.
     sizes = {"rls": [800], "oe": [800], "nlsm": [800], "greybox": [900, 800]}
-    assert [(kind, seed, len(rows)) for kind, seed, _, rows in fitted] == [
+    assert [(told.kind, told.seed, len(rows)) for told, rows in fitted] == [
         (kind, 5, number) for kind, numbers in sizes.items() for number in numbers
     ]
     assert known == ["greybox of 900"]
     # A set's epsilon is eight deviations of the louder output's noise; a grey box is of the cheaper settings.
-    assert fitted[2][2] == {"output_weight": 5.0, "epsilon": pytest.approx(8.0 * 0.2)}
-    assert (fitted[3][2], fitted[4][2]) == ({}, _auto.SHORT["greybox"])
+    nlsm, whole, short = (told for told, _ in fitted[2:])
+    assert (nlsm.output_weight, nlsm.epsilon) == (5.0, pytest.approx(8.0 * 0.2))
+    assert (nlsm.short, whole.short, short.short) == (True, False, True)
     race.whole("greybox")
     assert len(fitted) == 5
     assert 0.0 <= sum(one.seconds for one in race.tried.values()) <= time.perf_counter() - begin
@@ -447,19 +467,18 @@ def test_a_short_training_is_scored_on_each_part_and_a_failure_costs_its_own_tim
 
 @pytest.mark.parametrize("judged", [0, 1])
 @pytest.mark.parametrize("kind", ["rls", "greybox"])
-def test_a_whole_training_is_judged_again_and_held_to_what_its_short_one_kept(
+def test_a_whole_training_is_judged_again_and_examined_by_its_short_ones(
     judged: int, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     race, fitted = racing(monkeypatch, judged=judged)
-    race.short[kind] = "short"  # pyright: ignore[reportArgumentType]
-    race.tried[kind] = ran(kind, errors={"a": 1.5}, outputs={"a": FITS})
+    race.short[kind, race.folds[0]] = "short"  # pyright: ignore[reportArgumentType]
+    race.tried[kind] = ran(kind, errors={"a": 1.5})
     begin = time.perf_counter()
     race.whole(kind)
     one = race.tried[kind]
-    assert (one.model, one.whole) == (f"{kind} of 900" + ", held by short" * judged, True)
-    assert [(told, len(rows)) for _, _, told, rows in fitted] == [({}, 900)]
-    second = {_auto.SECOND: {"pitch": 10.0}} if judged else {}
-    assert one.outputs == {"a": FITS, HOLD_OUT: {"pitch": 90.0, "roll": 50.0}, **second}
+    assert (one.model, one.whole) == (f"{kind} of 900, examined", True)
+    assert [(told.short, len(rows)) for told, rows in fitted] == [(False, 900)]
+    assert one.examination == (["short"] * judged, False)
     assert one.errors == {"a": 1.5, HOLD_OUT: 3.0}
     assert one.scores == {"a": 70.0, HOLD_OUT: 70.0, COLD: 70.0}
     assert 1.0 <= one.seconds <= 1.0 + time.perf_counter() - begin
@@ -481,13 +500,14 @@ def test_later_parts_are_left_out_of_the_best_alone_until_no_other_could_win(mon
     race, fitted = racing(monkeypatch, more=3)
     fits = {"rls": 60.0, "oe": 90.0, "play": 75.0, "greybox": float("-inf"), "nlsm": 69.0, "nn": 50.0}
     race.tried = {kind: ran(kind, fit) for kind, fit in fits.items()}
-    race.short["oe"] = "short"  # pyright: ignore[reportArgumentType]
+    race.short["oe", race.folds[0]] = "short"  # pyright: ignore[reportArgumentType]
     monkeypatch.setattr(_auto, "numbers_of", lambda model: 5 + (not str(model).startswith("oe")))
     said: list[tuple[float, str]] = []
     begin = time.perf_counter()
     found = race.train_best(lambda share, what: said.append((share, what)))
     # All score 70 on a later part: `oe` falls behind `play`, which then falls to it; 69 could not have won.
-    assert [(kind, len(rows)) for kind, _, _, rows in fitted] == [
+    # What it was trained on for its scores, it is examined by.
+    assert [(told.kind, len(rows)) for told, rows in fitted] == [
         ("oe", 700), ("play", 700), ("oe", 699), ("oe", 698), ("oe", 900),
     ]  # fmt: skip
     assert (found.kind, found.whole) == ("oe", True)
@@ -587,14 +607,14 @@ def test_a_guarded_form_costs_its_own_time_and_tells_its_own_rows_held_out(monke
     race, _ = racing(monkeypatch)
     # Over the better of two bases.
     race.tried = {"greybox": ran("greybox", 50.0), "oe": ran("oe", 60.0), "rls": ran("rls", 90.0)}
-    best = ran("play", outputs={"a": FITS, _auto.SECOND: FITS, HOLD_OUT: FITS}, errors={"a": 1.0})
+    best = ran("play", errors={"a": 1.0})
     said: list[str] = []
     monkeypatch.setattr(Guarded, "fit", lambda settings, *_, **__: f"guarded {settings.of} {settings.base}")
     begin = time.perf_counter()
     chosen = race.guard_best(best, lambda _, what: said.append(what))
-    assert (chosen.kind, chosen.model, said) == ("guarded", "guarded play oe", ["guarded form of play"])
-    # What two trainings of its kind part is not its own; its hold-out is.
-    assert chosen.outputs == {"a": FITS, HOLD_OUT: {"pitch": 90.0, "roll": 50.0}}
+    assert (chosen.kind, chosen.model, said) == ("guarded", "guarded play oe, examined", ["guarded form of play"])
+    # Short forms of what it is made of stand for it.
+    assert chosen.examination == (["play of 800"], False)
     assert (chosen.left_out, chosen.errors, race.tried["guarded"]) == (best.left_out, best.errors, chosen)
     assert 0.0 <= chosen.seconds <= time.perf_counter() - begin
     # What diverged is no base, and a kind that failed has no guarded form.
@@ -617,9 +637,9 @@ def test_a_guarded_form_costs_its_own_time_and_tells_its_own_rows_held_out(monke
 def test_the_best_of_the_other_sort_is_trained_on_all_rows_once(whole: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     race, made = racing(monkeypatch)
     race.tried = {"rls": ran("rls", 80.0), "play": ran("play", 70.0, whole=whole), "nn": ran("nn", 60.0)}
-    race.short = dict.fromkeys(race.tried, "short")  # pyright: ignore[reportAttributeAccessIssue]
+    race.short["play", race.folds[0]] = "short"  # pyright: ignore[reportArgumentType]
     assert race.finish(race.tried["rls"], silent) is race.tried["rls"]
-    assert [kind for kind, *_ in made] == ([] if whole else ["play"])
+    assert [told.kind for told, _ in made] == ([] if whole else ["play"])
     assert race.tried["play"].whole
 
 
@@ -644,15 +664,13 @@ def test_no_exam_without_parts_left_out_and_none_twice(monkeypatch: pytest.Monke
 def test_a_choice_says_how_far_it_is_and_what_is_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     """Kinds are screened in a fixed order; those within half a point of the best are named beside it."""
     racing(monkeypatch)
-    monkeypatch.setattr(_auto, "folds", lambda *_, **__: [SimpleNamespace(train=TRAIN, judged=(part("a"),))])
+    monkeypatch.setattr(_auto, "folds", lambda *_, **__: [Fold(TRAIN, (part("a"),))])
     monkeypatch.setattr(_Race, "examine", lambda _: None)
-    monkeypatch.setattr(_auto, "other_motion", lambda _: True)
     monkeypatch.setattr(_Race, "guard_best", lambda _, best, tell: tell(0.5, "guard") or best)
     fits = {"rls": 80.0, "oe": 79.6, "play": 60.0, "nlsm": 79.0}
 
     def screen(self: _Race, kind: str) -> None:
         self.tried[kind] = ran(kind, fits[kind])
-        self.short[kind] = "short"  # pyright: ignore[reportArgumentType]
 
     def whole(self: _Race, kind: str) -> None:
         self.tried[kind] = replace(self.tried[kind], whole=True)
@@ -662,7 +680,7 @@ def test_a_choice_says_how_far_it_is_and_what_is_alike(monkeypatch: pytest.Monke
     said: list[tuple[float, str]] = []
     found = choose(TRAIN, OTHER, kinds=("nlsm", "play", "rls", "oe"), other_excitation=False, seed=4,
                    progress=lambda *told: said.append(told))  # fmt: skip
-    assert (found.chosen.kind, found.other_motion) == ("oe", True)  # fewer letters, which stand for numbers
+    assert found.chosen.kind == "oe"  # fewer letters, which stand for numbers
     assert [one.kind for one in found.ranking] == ["rls", "oe", "nlsm", "play"]
     assert "rls reaches 80.0 %" in found.why
     assert "nlsm" not in found.why

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 
 import softneck
-from softneck.core import DataError, silent
+from softneck.core import DataError
 from softneck.identification import INFINITE, Model, Play, SetMembership, identify, validate, with_tolerance
 from softneck.identification.models import _left_out
 from softneck.identification.models._directions import PAPER_TESTS, make_paper_tests
@@ -145,16 +144,14 @@ def test_given_settings_stay_in_the_short_form() -> None:
     assert shortened(Play(), "play") == Play()
 
 
-@dataclass(frozen=True)
-class _Refuses:
-    def fit(self, recording: Recording) -> Model:
-        raise DataError(f"{len(recording)} rows are too short")
-
-
 def test_a_motion_that_the_rest_does_not_determine_is_no_part() -> None:
     head, tail = neck_recording(1500).split(0.7)
     fitted = identify("rls", head, train=1.0)
-    found, same = examine(_Refuses(), fitted, head, tail, silent)
+
+    def refuse(fold: Fold) -> Model:
+        raise DataError(f"{len(fold.train)} rows are too short")
+
+    found, same = examine(refuse, fitted, head, tail, folds(head, tail, other_excitation=False))
     assert list(found.parts) == ["hold-out"]
     assert same is fitted
 
