@@ -33,6 +33,7 @@ from ..models._left_out import (
     exams,
     folds,
     free_runs,
+    other_motion,
     samples_to_judge,
 )
 from ..models._linear_systems import KINDS as LINEAR
@@ -42,7 +43,18 @@ from ..structured._greybox import as_found
 from ..uncertainty._guarded import BASES, OF, Guarded, fitted_base
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
-from ._examination import HOLD_OUT, NOT_FITTED, POOR_FIT_PCT, SHORT, Examination, Fits, examine, shortened
+from ._examination import (
+    HOLD_OUT,
+    NOT_FITTED,
+    POOR_FIT_PCT,
+    SHORT,
+    Examination,
+    Fits,
+    examine,
+    fits_to_reference,
+    part_of_reference,
+    shortened,
+)
 
 EXAM, COLD = "agreement", "cold start"
 # What is in a model file but was not found from data: sizes, tables, copies of rows in another order; and what says how
@@ -229,11 +241,12 @@ def choose(
     """Compare every kind by simulation of data left out, train the best on all of `train`, and choose.
 
     Each kind is identified in a short form on a part of the rows without their largest and fastest motions, and judged
-    on these, on `hold_out` and by how well it agrees with the others on motions that nobody recorded. The least of
-    these scores ranks. One run, recording or phase after the other is then left out of the best so far, until no other
-    could still win. The best, of those alike the one of the fewest numbers, is trained on all rows and judged on
-    `hold_out` again, from the first row only as well; where it then falls behind the next, that one is trained too. So
-    is the best linear kind, which controllers are designed on, or the best nonlinear one where the chosen is linear.
+    on these, on `hold_out` and, on motions that nobody recorded, by the grey box where that stands for the robot, else
+    by how well it agrees with the others. The least of these scores ranks. One run, recording or phase after the other
+    is then left out of the best so far, until no other could still win. The best, of those alike the one of the fewest
+    numbers, is trained on all rows and judged on `hold_out` again, from the first row only as well; where it then falls
+    behind the next, that one is trained too. So is the best linear kind, which controllers are designed on, or the best
+    nonlinear one where the chosen is linear.
 
     Of a learned kind that wins, the guarded form is taken: it falls back to
     the better of `greybox` and `oe` where its members part. A kind that fails is listed with its reason.
@@ -331,8 +344,8 @@ class _Race:
         self.tried[kind] = _with(KindTrial(kind, seconds, model, whole=False), found)
 
     def examine(self) -> None:
-        """Add the agreement of the kinds on unrecorded motions to the scores."""
-        if not self.folds[0].judged:
+        """Add the fits to the grey box on the paper's tests, or the agreement of the kinds elsewhere, to the scores."""
+        if not self.folds[0].judged or self._by_grey_box():
             return
         self._motions = self._motions or exams(self.folds[0].train)
         for one in self.tried.values():
@@ -345,6 +358,21 @@ class _Race:
         for kind, fit in agreement(self._free, voters).items():
             one = self.tried[kind]
             self.tried[kind] = replace(one, left_out={**one.left_out, EXAM: fit})
+
+    def _by_grey_box(self) -> bool:
+        """Add the fits to the grey box on the paper's tests, where it stands for the robot; return whether it does.
+
+        Kinds that share a bias agree: equations that predict what was left out far better have the only vote.
+        """
+        fold, found = self.folds[0], dict[str, float]()
+        for one in self.tried.values():
+            if one.model is not None and not (self.other_excitation or other_motion(self.train)):
+                reference, fits = fits_to_reference(one.model, one.model, fold)
+                found |= {one.kind: float(np.nanmean([*fits.values()]))} if reference == "greybox" else {}
+        for kind, fit in found.items():
+            one = self.tried[kind]
+            self.tried[kind] = replace(one, left_out={**one.left_out, part_of_reference("greybox"): fit})
+        return bool(found)
 
     def _leave_out(self, kind: str, fold: Fold) -> None:
         begin = time.perf_counter()

@@ -29,6 +29,7 @@ from softneck.identification.selection._auto import (
     kinds_to_try,
     numbers_of,
 )
+from softneck.identification.selection._examination import part_of_reference
 from softneck.identification.uncertainty import _guarded
 from softneck.identification.uncertainty._guarded import Base, Guarded
 from softneck.signals import Recording, concatenate
@@ -266,6 +267,7 @@ def test_of_the_linear_kinds_the_best_alone_votes_and_all_are_examined(monkeypat
     monkeypatch.setattr(_auto, "exams", lambda _: ["motion"])
     monkeypatch.setattr(_auto, "free_runs", lambda model, _: model)
     monkeypatch.setattr(_auto, "agreement", lambda runs, worth: voted.update(worth) or dict.fromkeys(runs, 33.0))
+    monkeypatch.setattr(_auto, "fits_to_reference", lambda *_: ("", {}))
     trying.examine()
     assert voted == {"oe": 85.0, "play": 60.0, "nn": 50.0}
     assert [one.kind for one in trying.tried.values() if one.left_out.get(EXAM) == 33.0] == ["rls", "oe", "play", "nn"]
@@ -648,6 +650,7 @@ def test_no_exam_without_parts_left_out_and_none_twice(monkeypatch: pytest.Monke
     monkeypatch.setattr(_auto, "exams", lambda rows: made.append(len(rows)) or ["motion"])
     monkeypatch.setattr(_auto, "free_runs", lambda model, _: made.append(model) or [])
     monkeypatch.setattr(_auto, "agreement", lambda runs, _: dict.fromkeys(runs, 33.0))
+    monkeypatch.setattr(_auto, "fits_to_reference", lambda *_: ("play", FITS))
     race, _ = racing(monkeypatch, judged=0)
     race.tried = {"rls": ran("rls")}
     race.examine()
@@ -659,6 +662,19 @@ def test_no_exam_without_parts_left_out_and_none_twice(monkeypatch: pytest.Monke
     assert made == [800, "rls made"]
     assert race.tried["rls"].left_out == {"a": 70.0, EXAM: 33.0}
     assert race.tried["oe"].left_out == {"a": 70.0}
+
+
+def test_where_the_grey_box_stands_for_the_robot_it_has_the_only_vote(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kinds that share a bias agree: on a neck with friction and slack they outvoted the equations that were right."""
+    monkeypatch.setattr(_auto, "agreement", lambda *_: pytest.fail("nobody else is asked"))
+    told = {"rls": ("greybox", FITS), "greybox": ("", {}), "play": ("play", FITS)}
+    monkeypatch.setattr(_auto, "fits_to_reference", lambda model, *_: told[model.split()[0]])
+    race, _ = racing(monkeypatch)
+    race.tried = {"oe": ran("oe", model=None), **{kind: ran(kind) for kind in told}}
+    race.examine()
+    left_out = {kind: one.left_out for kind, one in race.tried.items()}
+    own = {kind: {"a": 70.0} for kind in race.tried}
+    assert left_out == {**own, "rls": {"a": 70.0, part_of_reference("greybox"): 70.0}}
 
 
 def test_a_choice_says_how_far_it_is_and_what_is_alike(monkeypatch: pytest.MonkeyPatch) -> None:
