@@ -15,7 +15,7 @@ Lengths of tendon are in radians of motor, tensions in radians of stretch, so th
 - creep (two Maxwell branches): r' = creep_rate (b - r), q' = slow_creep_rate (b - q);
 - compression: s' = axial_rate (compliance (sum (T_j - pretension)) - s - 9 max(0, s - 1 / stop));
 - hysteresis (Dahl): z' = b' - |b'| z / friction_angle, so |z| <= friction_angle;
-- tilt: pitch = atan2(sin|b| b_1/|b|, cos|b|), roll likewise, through a dead time and a first-order lag.
+- tilt: pitch = atan(tan|b| b_1/|b|), roll likewise, through a dead time and a first-order lag.
 
 e_j points to tendon j: of a neck 120 deg apart or where it was found, times the arm of tendon j over that of the first;
 of another robot as its file says; with one output all lie in a plane.
@@ -110,10 +110,28 @@ def neck_directions(neck: np.ndarray, e: np.ndarray) -> None:
             e[1, j] = s * neck[NECK_TENDONS + j] + c * neck[NECK_TENDONS + motors + j]
 
 
+def neck_decays(neck: np.ndarray, body: np.ndarray, sample_time: float, substeps: int) -> tuple:
+    """Return what is left of a way after a substep or a sample: exact for what is held.
+
+    After a substep of a motor's way to its target and to its limit, after a sample of both creeps, of the sensor's and
+    of the largest bend.
+    """
+    dt = sample_time / substeps
+    return (
+        math.exp(-neck[NECK_DRIVE_RATE] * dt),
+        math.exp(-body[BODY_DRAG_RATE] * dt),
+        math.exp(-body[BODY_CREEP_RATE] * sample_time),
+        math.exp(-body[BODY_SLOW_CREEP_RATE] * sample_time),
+        math.exp(-neck[NECK_SENSOR_RATE] * sample_time),
+        math.exp(-_FORGET_RATE * sample_time),
+    )
+
+
 def neck_advance(
     neck: np.ndarray,
     body: np.ndarray,
     e: np.ndarray,
+    c: tuple,
     sample_time: float,
     substeps: int,
     targets: np.ndarray,
@@ -122,14 +140,15 @@ def neck_advance(
 ) -> None:
     """Move the motors `m` (motors,) towards `targets`, and the body in `x`, by one sample in so many substeps.
 
-    `e` (2, motors) is filled by `neck_directions`.
+    `e` (2, motors) is filled by `neck_directions`; `c`: see `neck_decays`.
     """
     dt = sample_time / substeps
-    keep = math.exp(-neck[NECK_DRIVE_RATE] * dt)  # exact for a target that is held
+    keep, held, kept, kept_slowly, _, lasting = c
     share = 0.5 if neck.shape[0] == NECK_SIZE else neck[NECK_SHARE]
     # Of a body that was not bent of late, at half of its reach.
     whole = neck[NECK_STIFFNESS] * (1.0 + 0.5 * body[BODY_SOFTENING])
-    whole *= 1.0 - body[BODY_LASTING] * (1.0 - math.exp(-2.0 * x.largest / body[BODY_REACH]))
+    if body[BODY_LASTING] > 0.0:
+        whole *= 1.0 - body[BODY_LASTING] * (1.0 - math.exp(-2.0 * x.largest / body[BODY_REACH]))
     creep = neck[NECK_STIFFNESS] * body[BODY_CREEP]
     slow_creep = neck[NECK_STIFFNESS] * body[BODY_SLOW_CREEP]
     softening = body[BODY_SOFTENING] / body[BODY_REACH]
@@ -140,7 +159,7 @@ def neck_advance(
     skew = abs(coupling) + 4.0 * (abs(lobe0) + abs(lobe1))
     most = dt * body[BODY_TOP_SPEED]
     drag = body[BODY_DRAG] * neck[NECK_PULL_LIMIT]
-    part = 1.0 - math.exp(-body[BODY_DRAG_RATE] * dt)
+    part = 1.0 - held
     arc = body[BODY_ARC]
     arm = 2.0 * arc / neck[NECK_LEVER]
     size = math.sqrt(x.b[0] * x.b[0] + x.b[1] * x.b[1])
@@ -176,11 +195,12 @@ def neck_advance(
         )
         f0 -= creep * (x.b[0] - x.r[0]) + slow_creep * (x.b[0] - x.q[0])
         f1 -= creep * (x.b[1] - x.r[1]) + slow_creep * (x.b[1] - x.q[1])
-        # Three lobes make it stiffer each 120 deg; divided, so that their slope stays bounded at large bends.
-        q = 2.0 * (x.b[0] * x.b[0] - x.b[1] * x.b[1]) / (body[BODY_REACH] + size)
-        p = 4.0 * x.b[0] * x.b[1] / (body[BODY_REACH] + size)
-        f0 -= stiffness * (coupling * (x.b[1] - neck[NECK_REST + 1]) + lobe0 * q - lobe1 * p)
-        f1 -= stiffness * (coupling * (x.b[0] - neck[NECK_REST]) - lobe0 * p - lobe1 * q)
+        if skew > 0.0:
+            # Three lobes make it stiffer each 120 deg; divided, so that their slope stays bounded at large bends.
+            q = 2.0 * (x.b[0] * x.b[0] - x.b[1] * x.b[1]) / (body[BODY_REACH] + size)
+            p = 4.0 * x.b[0] * x.b[1] / (body[BODY_REACH] + size)
+            f0 -= stiffness * (coupling * (x.b[1] - neck[NECK_REST + 1]) + lobe0 * q - lobe1 * p)
+            f1 -= stiffness * (coupling * (x.b[0] - neck[NECK_REST]) - lobe0 * p - lobe1 * q)
         # Minus the slope of f over b, one number for both directions: the cube's at its steepest, and half of each taut
         # tendon, as e e' of all three add up to 3/2.
         rate = stiffness + 3.0 * loss + share * taut * neck[NECK_GAIN] * neck[NECK_LEVER] + neck[NECK_FRICTION] + creep
@@ -209,13 +229,13 @@ def neck_advance(
             rise -= axial * touch * (x.s - 1.0 / body[BODY_STOP])
         # Its slope again: s itself, and each taut tendon, which gets looser as the link gives way.
         x.s += dt * rise / (1.0 + dt * axial * (1.0 + touch + neck[NECK_COMPLIANCE] * taut))
-    part = 1.0 - math.exp(-body[BODY_CREEP_RATE] * sample_time)
+    part = 1.0 - kept
     x.r[0] += part * (x.b[0] - x.r[0])
     x.r[1] += part * (x.b[1] - x.r[1])
-    part = 1.0 - math.exp(-body[BODY_SLOW_CREEP_RATE] * sample_time)
+    part = 1.0 - kept_slowly
     x.q[0] += part * (x.b[0] - x.q[0])
     x.q[1] += part * (x.b[1] - x.q[1])
-    x.largest = max(size, x.largest * math.exp(-_FORGET_RATE * sample_time))
+    x.largest = max(size, x.largest * lasting)
 
 
 def neck_crept(x: NeckState) -> None:
@@ -226,15 +246,15 @@ def neck_crept(x: NeckState) -> None:
     x.q[1] = x.b[1]
 
 
-def neck_sense(neck: np.ndarray, sample_time: float, x: NeckState) -> None:
+def neck_sense(c: tuple, x: NeckState) -> None:
     """Push the present tilt into the delay line, and step the sensor."""
     size = math.sqrt(x.b[0] * x.b[0] + x.b[1] * x.b[1])
-    part = math.sin(size) / size if size > 1e-9 else 1.0  # sin x / x: the straight neck divides by nothing
+    part = math.tan(size) / size if size > 1e-9 else 1.0  # tan x / x: the straight neck divides by nothing
     line = x.tilts
     lines = line.shape[0] // 2
-    keep = math.exp(-neck[NECK_SENSOR_RATE] * sample_time)
+    keep = c[4]
     for axis in range(2):
-        tilt = math.atan2(part * x.b[axis], math.cos(size))
+        tilt = math.atan(part * x.b[axis])
         first = axis * lines
         # Out comes the tilt of `lines` samples ago, before that of now goes in.
         seen = tilt
@@ -243,7 +263,7 @@ def neck_sense(neck: np.ndarray, sample_time: float, x: NeckState) -> None:
             for i in range(lines - 1, 0, -1):
                 line[first + i] = line[first + i - 1]
             line[first] = tilt
-        x.sensor[axis] = keep * x.sensor[axis] + (1.0 - keep) * seen  # exact for what is held over the sample
+        x.sensor[axis] = keep * x.sensor[axis] + (1.0 - keep) * seen
 
 
 def neck_run(
@@ -267,21 +287,22 @@ def neck_run(
     m = start.copy()
     e = np.empty((2, m.shape[0]))
     neck_directions(neck, e)
+    c = neck_decays(neck, body, sample_time, substeps)
     held = np.empty(m.shape[0])
     axes = outputs.shape[1]
     # Under set-points that stay: a run begins at rest, as its recording is taken to.
     for _ in range(settle):
-        neck_advance(neck, body, e, sample_time, substeps, start, m, x)  # pyright: ignore[reportArgumentType]
+        neck_advance(neck, body, e, c, sample_time, substeps, start, m, x)  # pyright: ignore[reportArgumentType]
         neck_crept(x)  # pyright: ignore[reportArgumentType]
-        neck_sense(neck, sample_time, x)  # pyright: ignore[reportArgumentType]
+        neck_sense(c, x)  # pyright: ignore[reportArgumentType]
     motors[0] = m
     outputs[0] = x[5 : 5 + axes]
     for k in range(targets.shape[0] - 1):
         for j in range(m.shape[0]):
             back = k + 1 - int(delay[j])
             held[j] = targets[back, j] if back >= 0 else start[j]
-        neck_advance(neck, body, e, sample_time, substeps, held, m, x)  # pyright: ignore[reportArgumentType]
-        neck_sense(neck, sample_time, x)  # pyright: ignore[reportArgumentType]
+        neck_advance(neck, body, e, c, sample_time, substeps, held, m, x)  # pyright: ignore[reportArgumentType]
+        neck_sense(c, x)  # pyright: ignore[reportArgumentType]
         motors[k + 1] = m
         outputs[k + 1] = x[5 : 5 + axes]
 
@@ -317,11 +338,12 @@ def greybox_rest(
     m = np.zeros(p.motors)
     e = np.empty((2, p.motors))
     neck_directions(neck, e)
+    c = neck_decays(neck, p.body, p.sensor[1], NECK_SUBSTEPS)
     for _ in range(int(p.memory[0])):
-        neck_advance(neck, p.body, e, p.sensor[1], NECK_SUBSTEPS, np.zeros(p.motors), m, x.neck)
+        neck_advance(neck, p.body, e, c, p.sensor[1], NECK_SUBSTEPS, np.zeros(p.motors), m, x.neck)
         neck_crept(x.neck)
         # The sensor settles with the neck: its dead time holds the tilt at rest.
-        neck_sense(neck, p.sensor[1], x.neck)
+        neck_sense(c, x.neck)
     for axis in range(p.outputs):
         echo_rest(p, x, axis, greybox_angle(x.neck, axis))
 
@@ -348,8 +370,9 @@ def greybox_step(
         targets[j] = x.u[int(p.drive[j, 1]) - 1, j]  # u(k+1-d); d >= 1 for this kind
     e = np.empty((2, p.motors))
     neck_directions(neck, e)
-    neck_advance(neck, p.body, e, p.sensor[1], NECK_SUBSTEPS, targets, m, x.neck)
-    neck_sense(neck, p.sensor[1], x.neck)
+    c = neck_decays(neck, p.body, p.sensor[1], NECK_SUBSTEPS)
+    neck_advance(neck, p.body, e, c, p.sensor[1], NECK_SUBSTEPS, targets, m, x.neck)
+    neck_sense(c, x.neck)
     ahead = np.empty(p.outputs)
     for axis in range(p.outputs):
         ahead[axis] = echo_added(p, p.echo, x, axis, greybox_angle(x.neck, axis))
