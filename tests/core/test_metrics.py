@@ -36,7 +36,7 @@ RATIOS = ("fits", "r2", "cold_fits", "coverage", "coverage_pct", "log_likelihood
 NO_METRICS: dict[type, set[str]] = {
     Validation: {"persistence", "best_linear", "worst_time", "intervals", "per_run", "diverged", "calibrated_bounds",
                  "validity", "time", "run", "measured", "free_run", "one_step", "lower", "upper"},
-    Consistency: {"level", "inside", "mean", "mean_band"}, NoiseFit: {"noise", "start"}, FittedObserver: set(),
+    Consistency: {"inside", "mean", "mean_band"}, NoiseFit: {"noise", "start"}, FittedObserver: set(),
     Draws: {"arrays", "factor", "share", "keep", "noise", "level", "conditions"},
     AxisMargins: {"band", "crossover", "margins", "at"}, SearchResult: set(),
     StepAndLoadResult: {"angles", "inputs"},
