@@ -123,12 +123,13 @@ def _keep_tuples(thing: Motors | Outputs | Directions) -> None:
 def motor_channels(motors: tuple[str, ...], outputs: tuple[str, ...], what: str) -> tuple[str, ...]:
     """Return the channel of each motor for a quantity, such as "setpoint", "position" or "position_measured".
 
-    `pressure` has `pressure_setpoint`; `motor_1`, or one whose channel would be another's, has `motor_setpoint_1`.
+    `pressure` and `pressure_setpoint` have `pressure_setpoint`; `motor_1`, `setpoint`, or one whose channel would be
+    another's, has `motor_setpoint_1`.
     """
-    stems, found = [name.removesuffix("_setpoint") for name in motors], []
+    stems, found = [re.sub(r"_setpoint(?=_\d+$|$)", "", name) for name in motors], []
     for j, (name, stem) in enumerate(zip(motors, stems, strict=True), start=1):
         other = stems.count(stem) > 1 or f"{stem}_{what.removesuffix('_measured')}" in outputs
-        numbered = name == f"motor_{j}" or other
+        numbered = name in (f"motor_{j}", "setpoint", f"setpoint_{j}") or other
         found.append(_with_number(what, j) if numbered else f"{stem}_{what}")
     return tuple(found)
 

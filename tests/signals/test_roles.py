@@ -9,7 +9,7 @@ import pytest
 
 from softneck import import_log
 from softneck.core import DataError, SettingsError, Vector
-from softneck.signals import columns_line, is_of_another_robot
+from softneck.signals import columns_line, is_of_another_robot, read_recording, write_recording
 from softneck.signals.importing._robot_guess import NamedColumns, RobotGuess, guess_robot, layout_for
 
 ROWS = 400
@@ -427,3 +427,20 @@ def test_messages_of_several_clocks_are_merged_for_any_robot(tmp_path: Path) -> 
     # The first row with a set-point before it is the second output after it.
     np.testing.assert_allclose(found.outputs[:, 0], 1e-3 * ONE[2:], rtol=1e-5)
     np.testing.assert_allclose(found.set_points[:, 0], 1e5 * np.repeat(A[1::2], 2)[: n - 2], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("motors", "channels"),
+    [(["heater_setpoint [W]"], ("heater_setpoint",)), (["setpoint [V]"], ("motor_setpoint_1",)),
+     (["setpoint_1 [V]", "setpoint_2 [V]"], ("motor_setpoint_1", "motor_setpoint_2")),
+     (["p_setpoint_1 [bar]", "p_setpoint_2 [bar]"], ("p_1_setpoint", "p_2_setpoint"))],
+)  # fmt: skip
+def test_a_motor_titled_as_set_point_is_named_so_once(
+    tmp_path: Path, motors: list[str], channels: tuple[str, ...]
+) -> None:
+    columns = dict(zip(motors, (A, B), strict=False))
+    write(tmp_path / "log.csv", {"time [s]": TIME, **columns, "height [mm]": ONE})
+    guess = guess_robot(tmp_path / "log.csv")
+    assert guess.robot.set_points == channels
+    write_recording(tmp_path / "rec.csv", import_log(tmp_path / "log.csv", guess.layout).recording)
+    assert read_recording(tmp_path / "rec.csv").set_points.shape == (ROWS, len(motors))
