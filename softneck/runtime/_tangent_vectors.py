@@ -18,8 +18,8 @@ _KEPT = re.compile(r"_[a-z]\d+|-?\d+(\.\d*)?(e-?\d+)?")
 _SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 # Derivatives of f(x), with v for f(x). That of a root of zero is set to 0: it has no finite slope.
 _SLOPES = {
-    "sin": "math.cos({x})", "cos": "-math.sin({x})", "tanh": "1.0 - {v} * {v}", "exp": "{v}", "log": "1.0 / {x}",
-    "sqrt": "0.5 / {v} if {v} > 0.0 else 0.0",
+    "sin": "math.cos({x})", "cos": "-math.sin({x})", "tan": "1.0 + {v} * {v}", "tanh": "1.0 - {v} * {v}",
+    "exp": "{v}", "log": "1.0 / {x}", "sqrt": "0.5 / {v} if {v} > 0.0 else 0.0", "atan": "1.0 / (1.0 + {x} * {x})",
 }  # fmt: skip
 # A length below 1e-12 is rounding and has no direction; this is its square.
 _NO_LENGTH = 1e-24

@@ -226,7 +226,7 @@ SMOOTH = {
     "functions": """
 a = math.sin(inputs[0]) * math.exp(-state[0]) + math.tanh(state[1]) ** 3
 outputs[0] = math.atan2(a, 2.0 + inputs[1]) / (1.5 + math.cos(a)) - math.log(3.0 + a)
-outputs[1] = math.sqrt(2.0 + a) + np.sqrt(2.0 + a * a)
+outputs[1] = math.atan(a) + math.sqrt(2.0 + a) - math.tan(0.1 * a) + np.sqrt(2.0 + a * a)
 state[2] -= outputs[0] * inputs[1]
 """,
     "branches": """

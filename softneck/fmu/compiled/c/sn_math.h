@@ -174,6 +174,16 @@ static double sn_cos(double x)
     return n == 1 || n == 2 ? -y : y;
 }
 
+static double sn_tan(double x)
+{
+    double r, t;
+    int n;
+    if (!sn_finite(x))
+        return x - x;
+    n = sn_quarters(x, &r, &t);
+    return n & 1 ? -sn_cos_small(r, t) / sn_sin_small(r, t) : sn_sin_small(r, t) / sn_cos_small(r, t);
+}
+
 /* tanh(|x|) = e / (e + 2) with e = exp(2 |x|) - 1; no branch, so that compilers take several at once. */
 static inline double sn_tanh(double x)
 {
@@ -230,6 +240,8 @@ static double sn_atan2(double y, double x)
         r = SN_PI - (r - 1.2246467991473532e-16);
     return sn_to_bits(y) >> 63 ? -r : r;
 }
+
+static double sn_atan(double x) { return sn_atan2(x, 1.0); }
 
 /* a % b of Python: the sign of b. */
 static double sn_fmod(double a, double b)

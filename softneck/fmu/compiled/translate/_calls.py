@@ -8,7 +8,10 @@ from typing import Protocol
 from ._scope import BOOL, FLOAT, INT, MATRIX, VECTOR, Scalar, Scope, Type, Value, View
 
 # Function of one number in numpy or math -> its name in C.
-_EACH = {"sqrt": "sqrt", "sin": "sn_sin", "cos": "sn_cos", "tanh": "sn_tanh", "exp": "sn_exp", "log": "sn_log"}
+_EACH = {
+    "sqrt": "sqrt", "sin": "sn_sin", "cos": "sn_cos", "tan": "sn_tan", "tanh": "sn_tanh", "exp": "sn_exp",
+    "log": "sn_log", "atan": "sn_atan",
+}  # fmt: skip
 _PAIR = {"atan2": "sn_atan2", "copysign": "copysign"}
 _ENTRYWISE = {"sqrt": "sn_sqrt_v", "tanh": "sn_tanh_v", "abs": "sn_absolute_v", "sort": "sn_sorted"}
 _REDUCTIONS = {"max": "sn_largest(w, {})", "min": "sn_least(w, {})"}
