@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -204,6 +203,8 @@ _SCREENED_WEIGHT, _EPSILON_SIGMAS = 5.0, 8.0
 _GUARD_COST = 2.0
 # So many kinds are trained on all rows at most, before the better of them is taken.
 _MOST_TRAINED = 2
+# How long a kind takes for one of the others, for the time left.
+_TIMES = {"greybox": 3, "nn": 7}
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -270,10 +271,10 @@ def choose(
             )
     left_out = folds(train, hold_out, other_excitation=other_excitation)
     race = _Race(train, hold_out, left_out, seed, other_excitation=other_excitation)
-    race.screen_all(wanted, lambda done, what: progress(0.7 * done, what))
+    race.screen_all(wanted, lambda done, what: progress(0.85 * done, what))
     race.examine()
-    best = race.train_best(lambda done, what: progress(0.7 + 0.2 * done, what))
-    chosen = race.finish(best, lambda done, what: progress(0.9 + 0.1 * done, what))
+    best = race.train_best(lambda done, what: progress(0.85 + 0.1 * done, what))
+    chosen = race.finish(best, lambda done, what: progress(0.95 + 0.05 * done, what))
     ranking = race.ranking()
     progress(1.0, f"chosen: {chosen.kind}")
     alike = [one for one in ranking if one.fit > best.fit - ALIKE and one not in (best, chosen)]
@@ -322,13 +323,14 @@ class _Race:
 
     def screen_all(self, kinds: Sequence[str], progress: Progress) -> None:
         """Screen the kinds side by side, the longest training first but for `nn`, which has a thread for each axis."""
-        begun = itertools.count()
+        order = sorted(kinds, key=lambda kind: kind != "greybox")
+        times = [_TIMES.get(kind, 1) for kind in order]
 
-        def screen(kind: str) -> None:
-            progress(next(begun) / len(kinds), _progress_text(kind, list(self.tried.values())))
-            self.screen(kind)
+        def screen(number: int) -> None:
+            progress(sum(times[:number]) / sum(times), _progress_text(order[number], list(self.tried.values())))
+            self.screen(order[number])
 
-        side_by_side([partial(screen, kind) for kind in sorted(kinds, key=lambda kind: kind != "greybox")])
+        side_by_side([partial(screen, number) for number in range(len(order))])
         self.tried = {kind: self.tried[kind] for kind in kinds}
 
     def screen(self, kind: str) -> None:

@@ -700,7 +700,7 @@ def test_a_choice_says_how_far_it_is_and_what_is_alike(monkeypatch: pytest.Monke
     assert [one.kind for one in found.ranking] == ["rls", "oe", "nlsm", "play"]
     assert "rls reaches 80.0 %" in found.why
     assert "nlsm" not in found.why
-    assert [share for share, _ in said] == pytest.approx([0.0, 0.175, 0.35, 0.525, 0.8, 0.95, 1.0])
+    assert [share for share, _ in said] == pytest.approx([0.0, 0.2125, 0.425, 0.6375, 0.9, 0.975, 1.0])
     assert [text for _, text in said] == [
         "rls", "oe (best so far rls, 80.0 %)", "play (best so far rls, 80.0 %)", "nlsm (best so far rls, 80.0 %)",
         "oe on all rows to train on", "guard", "chosen: oe",
