@@ -1312,6 +1312,8 @@ def test_a_step_over_an_observer_holds_where_every_loop_of_full_size_does(
     held = _certify.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, bounds)
     assert held is (lost is None)
     assert run == [(every[0], 0, "parallel", "eyes"), (every[1], 1, "parallel", "eyes")]
+    several = (*bounds, Requirement("sim.rise_s", "max", 0.5, True))
+    assert not _certify.holds_with_observer(task, Candidate("pi", {}, np.zeros(1)), observer, several), "not any bound"
     # An observer that makes the steps rise later is left out.
     for rise, quick in ((1.1, True), (1.0, True), (0.99, False)):
         item = Candidate("pi", {}, np.zeros(1), metrics={"sim.rise_s": rise})
