@@ -88,7 +88,7 @@ class Values:
 
     def _apart(self, value: Any) -> Any:
         """Return the value (a divisor, or an argument of log) where its branch is taken, and 1 elsewhere."""
-        if self.under is None or not self.symbolic(value):
+        if self.under is None or not (self.symbolic(value) or value == 0.0):
             return value
         return self.choose(self.under, value, 1.0)
 
