@@ -417,6 +417,9 @@ class _Race:
         calls: list[Callable[[], KindTrial]] = [lambda: self.guard_best(best, progress)]
         chosen, *trained = side_by_side(calls + [partial(self._trained, one.kind) for one in others])
         self.tried |= {one.kind: one for one in trained}
+        # On all rows it may have failed, or be worse than the next, which then is the best of the others.
+        while left := [one.kind for one in best_others(self.ranking(), chosen).values() if not one.whole]:
+            self.whole(left[0])
         return chosen
 
     def guard_best(self, best: KindTrial, progress: Progress) -> KindTrial:

@@ -645,6 +645,20 @@ def test_the_best_of_the_other_sort_is_trained_on_all_rows_once(whole: bool, mon
     assert race.tried["play"].whole
 
 
+@pytest.mark.parametrize("fit", [50.0, float("-inf")], ids=["worse", "failed"])
+def test_what_is_the_best_of_the_others_in_the_end_is_trained_on_all_rows(
+    fit: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its file had the short form, without a fit on the rows held out."""
+    race, _ = racing(monkeypatch)
+    race.tried = {"rls": ran("rls", 80.0), "play": ran("play", 70.0, whole=False), "nn": ran("nn", 60.0, whole=False)}
+    after = {"play": fit, "nn": 55.0}
+    monkeypatch.setattr(_Race, "_trained", lambda _, kind: ran(kind, after[kind], whole=True))
+    race.finish(race.tried["rls"], silent)
+    other = _auto.best_others(race.ranking(), race.tried["rls"])["nonlinear"]
+    assert (other.kind, other.whole, other.fit) == ("nn", True, 55.0)
+
+
 def test_no_exam_without_parts_left_out_and_none_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
     monkeypatch.setattr(_auto, "exams", lambda rows: made.append(len(rows)) or ["motion"])
