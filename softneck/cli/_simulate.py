@@ -130,14 +130,14 @@ def _simulate_system(
     if as_json:
         print_json(result.report())
         return
-    click.echo(f"{path}: {len(result.signals.signals)} signals, {result.real_time_factor:.0f} times real time")
+    click.echo(f"{path}: {len(result.signals.signals)} signals, {result.real_time_factor:,.1f} times real time")
 
 
 def _print(path: Path, result: cosim.Result) -> None:
     print_table(str(path), *_metrics(result))
     if result.limits:
         print_table("Limits", *_limits(result))
-    click.echo(f"{result.real_time_factor:.0f} times real time")
+    click.echo(f"{result.real_time_factor:,.1f} times real time")
 
 
 def _metrics(result: cosim.Result) -> tuple[list[str], list[list[str]]]:

@@ -30,7 +30,7 @@ def loop_page(name: str, result: Result, *, faults: Sequence[Mapping[str, Any]] 
     method = [
         "Play or move the slider: outputs and the upright line follow. The strip below it marks faults (purple), times "
         "of limits (black) and where an overshoot exceeds its limit (red).",
-        f"Order {result.order}, metrics of the {result.angle} {what}, {result.real_time_factor:.0f} times real time.",
+        f"Order {result.order}, metrics of the {result.angle} {what}, {result.real_time_factor:,.1f} times real time.",
     ]
     tables = [Table("Metrics", ["metric", "value"], _metrics(result))]
     if result.limits:
