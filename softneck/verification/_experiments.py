@@ -118,7 +118,7 @@ class Crossing:
         amplitude: of the step [rad].
         posture: outputs [rad] relative to their middle.
         value: factor on the gain (above 1 in both directions) or delay [s]; inf where none was found.
-        hunts: limit cycle at gain 1, peak to peak [rad].
+        hunts: limit cycle at gain 1, peak to peak [rad]; inf if the loop diverges or does not respond to the step.
         robot: of the outputs.
     """
 
@@ -181,7 +181,7 @@ def _scan_group(loop: LoopUnderTest, axes: str, what: str, least: float) -> list
         floor, value = case.floor(), none
         if case.comes_to_rest(floor):
             value = _first_crossing(case, floor, least, sparse)
-        hunts = floor if _REPORTED_SHARE * amplitude < floor < math.inf else 0.0
+        hunts = floor if floor > _REPORTED_SHARE * amplitude else 0.0
         found.append(Crossing(loop.name, axes, what, amplitude, posture, value, hunts, loop.robot))
         least = min(least, value)
     return found
@@ -381,8 +381,12 @@ def crossing_facts(item: Crossing) -> dict[str, Any]:
     """Return the facts on a crossing as JSON values."""
     unit, factor = error_unit(item.robot)
     per = math.radians(1.0) if factor is None else factor
+    name = item.plant
+    if item.hunts == math.inf:  # motors at their limits, for one
+        at = ", ".join(f"{(a + b) / per:.3g}" for a, b in zip(middle_of(item.robot), item.posture, strict=True))
+        name += f" diverges or does not respond around {at} {unit} (`rest` of outputs and motors)"
     return {
-        "kind": "experiment", "name": item.plant, "axis": item.axes, "raised": item.what,
+        "kind": "experiment", "name": name, "axis": item.axes, "raised": item.what,
         f"kick_{unit}": item.amplitude / per, f"posture_{unit}": [x / per for x in item.posture],
         f"hunts_{unit}": item.hunts / per,
     }  # fmt: skip

@@ -26,6 +26,7 @@ from softneck.verification._experiments import (
     _Kicked,
     _oscillation,
     _scan_group,
+    crossing_facts,
     crossing_values,
     crossings,
     scale_loop_gain,
@@ -210,6 +211,15 @@ def test_where_a_loop_hunts_at_gain_1_there_is_no_less_to_look_for(monkeypatch: 
         assert {x.what: x.value for x in found} == {"gain_up": 1.0, "gain_down": 1.0, "delay": 0.0} or overall
         assert crossing_values(found)["axes.delay_margin_ms"][0].min() == 0.0
         assert crossing_values(found)["axes.gain_margin"][0].min() == 1.0
+
+
+def test_a_loop_that_does_not_respond_is_named_with_its_posture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bellows that rest at 3 mm were stepped around 0 mm, and all that was told was a gain margin of 1."""
+    monkeypatch.setattr(Experiment, "_windows", lambda *_: (0.0, math.inf))
+    found = crossings([over(all_plants([source_of_family(family(), "f")], 2, 0), 0)])
+    assert {x.value for x in found if x.what == "delay"} == {0.0}
+    assert "diverges or does not respond around 0, 0 deg" in crossing_facts(found[0])["name"]
+    assert crossing_facts(replace(found[0], hunts=0.0))["name"] == found[0].plant
 
 
 def test_a_quieter_loop_oscillates_by_more_than_what_late_axes_do_to_each_other(
