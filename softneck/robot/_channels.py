@@ -127,7 +127,7 @@ def motor_channels(motors: tuple[str, ...], outputs: tuple[str, ...], what: str)
     another's, has `motor_setpoint_1`.
     """
     stems, found = [re.sub(r"_setpoint(?=_\d+$|$)", "", name) for name in motors], []
-    for j, (name, stem) in enumerate(zip(motors, stems, strict=True), start=1):
+    for j, stem in enumerate(stems, start=1):
         other = stems.count(stem) > 1 or f"{stem}_{what.removesuffix('_measured')}" in outputs
         numbered = stem in (f"motor_{j}", "setpoint", f"setpoint_{j}") or other
         found.append(_with_number(what, j) if numbered else f"{stem}_{what}")
