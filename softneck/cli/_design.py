@@ -166,7 +166,7 @@ def _fit(
     ]
     if found.not_identifiable:
         lines.append(f"  not told by the data: {', '.join(found.not_identifiable)}")
-    errors = ", ".join(f"{name} {error / to_si(unit)[0]:.3f}" for name, error in found.checks.items())
+    errors = ", ".join(f"{name} {error / to_si(unit)[0]:.4g}" for name, error in found.checks.items())
     verdict = "no better, so the defaults are kept" if found.kept == "default" else f"{found.kept} kept"
     lines.append(f"  error [{unit}] of the look ahead on {found.rows} rows held out: {errors}: {verdict}")
     for path, recording in zip(data, recordings, strict=True):

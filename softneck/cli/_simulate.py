@@ -144,7 +144,7 @@ def _metrics(result: cosim.Result) -> tuple[list[str], list[list[str]]]:
     rows = []
     for part, values in result.metrics.items():
         rows += [
-            [f"{part}.{name}", "-" if value is None else f"{value:.3f}"]
+            [f"{part}.{name}", "-" if value is None else f"{value:.5g}"]
             for name, value in values.items()
             if name != "slack_s" or result.robot.tendon_angles is not None
         ]
@@ -154,7 +154,7 @@ def _metrics(result: cosim.Result) -> tuple[list[str], list[list[str]]]:
 def _limits(result: cosim.Result) -> tuple[list[str], list[list[str]]]:
     rows = []
     for row in result.limits:
-        value = "-" if row["value"] is None else f"{row['value']:.3f}"
+        value = "-" if row["value"] is None else f"{row['value']:.5g}"
         rows.append([row["metric"], f"{row['limit']:.4g}", value, "holds" if row["holds"] else "fails"])
     return ["metric", "limit", "value", "verdict"], rows
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import rich.console
@@ -12,6 +14,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from softneck.cli import _simulate
 from softneck.cli.shared._console import note, print_table, progress
 
 # What a terminal shows in a place of its own: no controls, and no marks that join the letter before them.
@@ -62,3 +65,11 @@ def test_progress_shows_names_of_files_as_they_are(text: str, monkeypatch: pytes
 def test_remarks_are_printed_as_they_are(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     note(text)
     assert capsys.readouterr().err == f"{text}\n"
+
+
+def test_values_in_a_large_unit_are_not_shown_as_zero() -> None:
+    row = {"metric": "height.rms_error_m", "limit": 0.001, "value": 0.00012345, "holds": True}
+    asked: Any = SimpleNamespace(limits=[row])
+    assert _simulate._limits(asked)[1] == [["height.rms_error_m", "0.001", "0.00012345", "holds"]]
+    shown: Any = SimpleNamespace(metrics={"height": {"rms_error_m": 0.00012345}}, robot=None)
+    assert _simulate._metrics(shown)[1] == [["height.rms_error_m", "0.00012345"]]
