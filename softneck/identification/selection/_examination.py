@@ -82,7 +82,7 @@ class Examination:
         """Return the fit to be expected on other motions [%]; NaN where nothing could be left out of a training."""
         if self.reference:
             fits = self.parts[part_of_reference(self.reference)].values()
-            return min((fit for fit in fits if fit == fit), default=float("nan"))
+            return float(np.fmin.reduce([*fits]))
         if kind in AGAIN and set(self.parts) == {HOLD_OUT}:
             return float("nan")
         return 100.0 - MISSING.get(kind, (1.0, 1.0))[self.other_motion] * (100.0 - self.worst[2])

@@ -12,6 +12,7 @@ from fmpy import simulate_fmu
 from softneck import load
 from softneck.fmu import build_compiled_fmu
 from softneck.identification import Model, Play
+from softneck.identification.structured import _play
 from softneck.identification.structured._play_draws import PlayDraws
 from softneck.robot import Robot
 from softneck.signals import Recording
@@ -63,15 +64,19 @@ def error(model: Model, recording: Recording) -> float:
 
 
 @pytest.mark.parametrize(("filling", "venting"), [(0.05, 0.15), (0.15, 0.05)])
-def test_valves_are_found_and_help_on_another_recording(filling: float, venting: float) -> None:
+def test_valves_are_found_and_help_on_another_recording(
+    filling: float, venting: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model, other = Play().fit(recorded(filling, venting)), recorded(filling, venting, seed=5)
     found = model.findings
     # Filters of one speed stand for the lags behind, and take a part of the shorter time: the order is certain.
     assert (found["venting_s"] > 1.5 * found["filling_s"]) == (venting > filling)
     assert found["venting_s"] > 1.5 * found["filling_s"] or found["filling_s"] > 1.5 * found["venting_s"]
-    alike = Play().fit(recorded(0.1, 0.1))
-    assert error(model, other) < 0.02, "twenty times the sensor's noise"
-    assert error(alike, other) > 2.0 * error(model, other), "a chamber of one speed does not follow this one"
+    monkeypatch.setattr(_play, "_VALVE_MISFIT", 0.0)
+    without = Play().fit(recorded(filling, venting))
+    assert without.arrays["load"].size == 4
+    # Both lags behind are in the filters already: what is left is the difference of the speeds.
+    assert error(without, other) > 4.0 * error(model, other)
 
 
 def test_a_chamber_of_one_speed_has_no_valves() -> None:
