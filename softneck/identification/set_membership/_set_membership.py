@@ -282,10 +282,15 @@ class SetMembership:
         return Ground(
             table=table,
             drive=drive,
-            base=resolve(find_kind(self.base, "model").settings)().fit(recording) if residual else None,
+            base=self._base().fit(recording) if residual else None,
             # What the set sees when it is used: the drive model's positions in simulation, which `residual` always is.
             measured=not residual,
         )
+
+    def _base(self) -> Any:
+        """Return the settings of the base; `oe` takes two poles where a recording resonates, unless told otherwise."""
+        settings = resolve(find_kind(self.base, "model").settings)
+        return settings(nf=1) if self.base == "oe" else settings()
 
     def _choose(
         self, ground: Ground, training: ScaledData, noise: Vector, asked: Vector | None, progress: Progress

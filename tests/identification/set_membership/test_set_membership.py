@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from softneck.core import DataError, SettingsError
-from softneck.identification import PAPER_EQ21, Model, SetMembership, is_extrapolating
+from softneck.identification import PAPER_EQ21, Model, OutputError, SetMembership, is_extrapolating
 from softneck.identification.models._regressors import regression
 from softneck.identification.set_membership._regressor import (
     LEAF,
@@ -290,6 +291,24 @@ def test_the_scale_is_of_the_lags_that_the_set_is_over() -> None:
     recording = Recording.from_arrays(u[:, None], y[:, None], sample_time=2.0, robot=heater)
     model = SetMembership(form="residual").fit(recording)
     assert len(model.findings["scale"]) == len(model.arrays["table"])
+
+
+def test_the_base_of_a_residual_has_one_pole_also_where_the_robot_resonates() -> None:
+    """By itself `oe` takes two poles there, and the set's simulation has one: every kind is compared in that form."""
+    robot = Robot.from_dict({
+        "name": "arm", "motors": {"names": ["m"], "unit": "A"}, "outputs": {"names": ["tip"], "unit": "mm"},
+        "directions": {"kind": "matrix", "matrix": [[1.0]]},
+    })  # fmt: skip
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-2.0, 2.0, 60), 33)
+    pole = np.exp(0.24 * (-0.003 + 1j))
+    y = np.asarray(lfilter([0.0, 1e-3], np.poly([pole, pole.conj()]).real, u))
+    y += 0.05 * y.std() * rng.standard_normal(y.size)
+    recording = Recording.from_arrays(u[:, None], y[:, None], sample_time=0.02, robot=robot)
+    assert OutputError().fit(recording).settings["nf"] == 2
+    model = SetMembership(form="residual", output_weight=1.0, epsilon=5.0 * float(y.std())).fit(recording)
+    assert model.arrays["a"].shape == (1, 1)
+    assert np.isfinite(model.simulate(recording)).all()
 
 
 def test_a_residual_cannot_drift(models: dict) -> None:
