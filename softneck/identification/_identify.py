@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from inspect import signature
 from pathlib import Path
@@ -41,8 +42,8 @@ from .models._fitting import check_training, payload_of
 from .models._left_out import folds
 from .models._model import Model
 from .models._validity import with_tolerance
-from .selection._auto import Choice, choose
-from .selection._examination import AGAIN, Examination, examine, shortened
+from .selection._auto import Choice, KindTrial, best_others, choose, settings_of
+from .selection._examination import AGAIN, NOT_FITTED, Examination, examine, shortened
 from .structured._greybox import as_found
 from .uncertainty._draws import make_draws
 from .uncertainty._family import Family
@@ -148,7 +149,7 @@ def identify(
     Args:
         kind: name in the table of kinds: "rls", "oe", "nlsm", "nn", ...; "auto" compares all of them and returns the
             best, with the reason in `findings["chosen"]` (`choose` returns the whole ranking). It holds out the last
-            of several recordings as a whole; its only setting is `seed`.
+            of several recordings as a whole, and then trains the best on all; its only setting is `seed`.
         recording: a recording, its file, a DataFrame, an array of a `robot`, or a list of several.
         train: part of each run, from its start, to train on; 1 holds nothing out.
         robot: of the recording; None takes `robot.toml` beside a file or above it, else that of the recording.
@@ -230,13 +231,42 @@ def _best_kind(
 
 
 def choose_kind(parts: Sequence[Recording], *, name: str, train: float, seed: int, progress: Progress) -> Choice:
-    """Compare all kinds by `auto`; the last of several recordings, called `name`, is held out as a whole."""
+    """Compare all kinds by `auto`; the last of several recordings, called `name`, is held out as a whole meanwhile."""
     head, tail, other = _split_for_choice(parts, train)
     check_training(head)
     still = why_at_rest(tail, concatenate(parts))
     if still is not None:
         raise DataError(f"{name}: {still}. Record motion to the end, or hold out other rows by `train`.")
-    return choose(head, tail, other_excitation=other, seed=seed, progress=progress)
+    part = 0.7 if other else 1.0
+    choice = choose(
+        head, tail, other_excitation=other, seed=seed, progress=lambda done, text: progress(part * done, text)
+    )
+    if not other:
+        return choice
+    late = lambda done, text: progress(part + (1.0 - part) * done, text)  # noqa: E731
+    return _trained_on_all(choice, concatenate(parts), train, seed, late)
+
+
+# Settings of a guarded model that a choice has found.
+_OF_GUARDED = ("of", "base", "members")
+
+
+def _trained_on_all(choice: Choice, whole: Recording, train: float, seed: int, progress: Progress) -> Choice:
+    """Return the choice with its models trained on all recordings, as by `identify KIND`.
+
+    These are the chosen model and the best of the other sort, linear or not. What decided had been held out from them.
+    """
+    wanted, again = [choice.chosen, *best_others(choice.ranking, choice.chosen).values()], dict[str, KindTrial]()
+    for number, one in enumerate(wanted):
+        made_of = one.model.settings if one.kind == "guarded" and one.model is not None else {}
+        settings = settings_of(one.kind, seed, {name: made_of[name] for name in _OF_GUARDED if name in made_of})
+        part = lambda done, text, n=number: progress((n + done) / len(wanted), text)  # noqa: E731
+        with suppress(*NOT_FITTED):  # the model without the last recording stands
+            model, judged = fit_and_validate(settings, whole, train=train, tolerance=None, progress=part)
+            again[one.kind] = replace(one, model=model, judged=judged, examination=None)
+    ranking = tuple(again.get(one.kind, one) for one in choice.ranking)
+    why = f"{choice.why} Then it is trained on all recordings, of each run its first {100.0 * train:.3g} %."
+    return replace(choice, ranking=ranking, chosen=again.get(choice.chosen.kind, choice.chosen), why=why)
 
 
 def _split_for_choice(parts: Sequence[Recording], train: float) -> tuple[Recording, Recording, bool]:

@@ -140,7 +140,13 @@ def test_auto_prints_one_json_object_and_holds_out_the_last_of_several(call: Cal
     assert facts["remarks"] == []
     assert facts["chosen"] in [entry["kind"] for entry in facts["ranking"]]
     chosen = next(entry for entry in facts["ranking"] if entry["kind"] == facts["chosen"])
-    assert chosen["hold_out"]["rows_scored"] == 275
+    # The model is that of all recordings: the last 30 % of both are held out, less 25 rows each that align.
+    assert chosen["hold_out"]["rows_scored"] == round(0.3 * (600 + 300)) - 2 * 25
+    model, again = load(Path("build/models/auto.npz")), softneck.identify(facts["chosen"], [recording, "other.csv"])
+    assert {name: values.tobytes() for name, values in model.arrays.items()} == {
+        name: values.tobytes() for name, values in again.arrays.items()
+    }
+    assert model.findings["examination"] == again.findings["examination"]
     assert chosen["fit"] == min(chosen["scores"].values())
     assert {"largest motions", "other excitation", "trained on the other", "hold-out", "cold start"} <= set(
         chosen["scores"]

@@ -346,8 +346,11 @@ class _Race:
         self.tried[kind] = _with(KindTrial(kind, seconds, model, whole=False), found)
 
     def examine(self) -> None:
-        """Add the fits to the grey box on the paper's tests, or the agreement of the kinds elsewhere, to the scores."""
-        if not self.folds[0].judged or self._by_grey_box():
+        """Add the fits to the grey box on the paper's tests, or the agreement of the kinds elsewhere, to the scores.
+
+        Where another experiment is held out, that is what tells: kinds that share a bias would outvote the best.
+        """
+        if self.other_excitation or not self.folds[0].judged or self._by_grey_box():
             return
         self._motions = self._motions or exams(self.folds[0].train)
         for one in self.tried.values():
@@ -368,7 +371,7 @@ class _Race:
         """
         fold, found = self.folds[0], dict[str, float]()
         for one in self.tried.values():
-            if one.model is not None and not (self.other_excitation or other_motion(self.train)):
+            if one.model is not None and not other_motion(self.train):
                 reference, fits = fits_to_reference(one.model, one.model, fold)
                 found |= {one.kind: float(np.nanmean([*fits.values()]))} if reference == "greybox" else {}
         for kind, fit in found.items():
@@ -437,7 +440,7 @@ class _Race:
             if bases[0] == "oe":
                 model = settings.fit(self.train, progress=progress)
             else:
-                base = fitted_base("greybox", self.train, _settings("greybox", self.seed, SHORT["greybox"]))
+                base = fitted_base("greybox", self.train, settings_of("greybox", self.seed, SHORT["greybox"]))
                 parts = [best.model, self._short(best.kind, self.folds[0])]
                 model = replace(settings, members=len(parts)).around(base, parts, self.train)
             judged, (examination, model) = self._validate("guarded", model), self._examined(best.kind, model)
@@ -485,13 +488,13 @@ class _Race:
     def _fitted(self, kind: str) -> Model:
         """Return the model of all rows to train on, which is trained once."""
         if kind not in self._whole:
-            self._whole[kind] = _settings(kind, self.seed, {}).fit(self.train)
+            self._whole[kind] = settings_of(kind, self.seed, {}).fit(self.train)
         return self._whole[kind]
 
     def _short(self, kind: str, fold: Fold) -> Model:
         """Return the short form of a kind without what a fold leaves out, which is trained once."""
         if (kind, fold) not in self.short:
-            settings = shortened(_settings(kind, self.seed, {}), kind)
+            settings = shortened(settings_of(kind, self.seed, {}), kind)
             if kind == "greybox":  # its dead time and parts are properties of the robot: known once
                 settings = as_found(settings, self._fitted(kind))
             if kind == "nlsm":
@@ -514,7 +517,8 @@ def _with(one: KindTrial, found: Mapping[str, tuple[Fits, float]]) -> KindTrial:
     return replace(one, left_out={**one.left_out, **left_out}, errors={**one.errors, **errors})
 
 
-def _settings(kind: str, seed: int, other: Mapping[str, Any]) -> Any:
+def settings_of(kind: str, seed: int, other: Mapping[str, Any]) -> Any:
+    """Return the settings with which `choose` trains a kind."""
     settings = resolve(KINDS[kind].settings)
     values = {**_SETTINGS.get(kind, {}), **other}
     if "seed" in settings.__dataclass_fields__:

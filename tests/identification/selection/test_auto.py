@@ -271,6 +271,13 @@ def test_of_the_linear_kinds_the_best_alone_votes_and_all_are_examined(monkeypat
     trying.examine()
     assert voted == {"oe": 85.0, "play": 60.0, "nn": 50.0}
     assert [one.kind for one in trying.tried.values() if one.left_out.get(EXAM) == 33.0] == ["rls", "oe", "play", "nn"]
+    # Another experiment tells what the kinds are worth: they do not vote on it.
+    told = _Race(TRAIN, OTHER, [fold], 0, other_excitation=True)
+    told.tried = {
+        kind: replace(one, left_out={"fast": one.left_out.get("fast", 0.0)}) for kind, one in trying.tried.items()
+    }
+    told.examine()
+    assert all(EXAM not in one.left_out for one in told.tried.values())
 
 
 def test_a_weighted_median_is_that_of_values_repeated_as_often() -> None:
@@ -416,7 +423,7 @@ def racing(monkeypatch: pytest.MonkeyPatch, *, judged: int = 1, more: int = 0, f
                 raise DataError("it saturates")
             return f"{self.kind} of {len(recording)}"
 
-    monkeypatch.setattr(_auto, "_settings", Settings)
+    monkeypatch.setattr(_auto, "settings_of", Settings)
     monkeypatch.setattr(_auto, "shortened", lambda settings, kind: replace(settings, short=kind == settings.kind))
     monkeypatch.setattr(_auto, "all_rows", lambda name, _: part(name, {"pitch": 90.0, "roll": 50.0}, 3.0))
     monkeypatch.setattr(_auto, "numbers_of", lambda model: len(str(model)))
@@ -766,8 +773,8 @@ def test_what_is_wary_of_a_ranking_is_said_of_it() -> None:
 
 @pytest.mark.parametrize("kind", kinds_to_try())
 def test_kinds_that_start_at_random_have_the_seed_of_the_choice(kind: str) -> None:
-    made = _auto._settings(kind, 7, {})
+    made = _auto.settings_of(kind, 7, {})
     assert getattr(made, "seed", 7) == 7
     if kind == "nlsm":
         assert made.form == "residual"
-        assert _auto._settings(kind, 7, {"epsilon": 0.5}).epsilon == 0.5
+        assert _auto.settings_of(kind, 7, {"epsilon": 0.5}).epsilon == 0.5
