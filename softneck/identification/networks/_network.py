@@ -105,9 +105,9 @@ class Network:
     """
 
     hidden: tuple[int, int] | None = None
-    iterations: int = 30
-    refine: int = 24
-    starts: int = 3
+    iterations: int = 20
+    refine: int = 15
+    starts: int = 5
     decay: float | None = None
     prior: float = 0.1
     seed: int = 0

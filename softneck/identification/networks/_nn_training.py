@@ -14,11 +14,11 @@ from softneck.signals import Recording
 from ..models._regressors import lagged_columns
 from ..models._scores import nrmse_fit
 
-# Factors on the damping after success and failure (Hagan and Menhaj 1994), and where the search gives up.
-_SHRINK, _GROW, _MAX_DAMPING = 0.2, 4.0, 1e10
+# Damping at first, at least, and where the search gives up.
+_FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-2, 1e-9, 1e10
 
-# (w, derivatives) -> errors (rows,) at w and, if wanted, derivatives (rows, w) of the model.
-Errors = Callable[[Vector, bool], tuple[Vector, Matrix | None]]
+# (w, J) -> errors (rows,) at w; J (rows, w), if there is one, gets the derivatives of the model.
+Errors = Callable[[Vector, Matrix | None], Vector]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,26 +66,40 @@ def random_layers(n: int, hidden: tuple[int, int], rng: np.random.Generator) -> 
     )
 
 
-def jacobian(layers: Layers, Z: Matrix) -> tuple[Vector, Matrix]:
-    """Return the outputs (rows,) and their derivatives by all weights (rows, weights)."""
+def jacobian(layers: Layers, Z: Matrix, J: Matrix) -> Vector:
+    """Return the outputs (rows,), and fill `J` (rows, weights) with their derivatives by all weights."""
     H1, H2 = layers.layer_values(Z)
     D2 = (1.0 - H2**2) * layers.w3
     D1 = (D2 @ layers.W2) * (1.0 - H1**2)
-    rows = Z.shape[0]
-    by_W1 = (D1[:, :, None] * Z[:, None, :]).reshape(rows, -1)
-    by_W2 = (D2[:, :, None] * H1[:, None, :]).reshape(rows, -1)
-    return H2 @ layers.w3 + layers.b3, np.hstack([by_W1, D1, by_W2, D2, H2, np.ones((rows, 1))])
+    at = 0
+    for by_neuron, inputs in ((D1, Z), (D2, H1)):
+        rows, count, n = *by_neuron.shape, inputs.shape[1]
+        np.multiply(by_neuron[:, :, None], inputs[:, None, :], out=J[:, at : at + count * n].reshape(rows, count, n))
+        at += count * n
+        J[:, at : at + count] = by_neuron
+        at += count
+    J[:, at:-1], J[:, -1] = H2, 1.0
+    return H2 @ layers.w3 + layers.b3
 
 
 def levenberg(
-    errors: Errors, start: Vector, *, iterations: int, decay: float, on_step: Callable[[Vector, float], bool]
+    errors: Errors,
+    start: Vector,
+    weight: Vector,
+    *,
+    iterations: int,
+    decay: float,
+    on_step: Callable[[Vector, float], bool],
 ) -> Vector:
-    """Minimise `|errors(w)|^2 + decay |w|^2` over w by Levenberg and Marquardt; return the last w.
+    """Minimise `|weight errors(w)|^2 + decay |w|^2` over w by Levenberg and Marquardt; return the last w.
 
-    `on_step` gets w and its cost at the start and after each step; False ends the search.
+    The damping follows the gain of a step over the promised one (Nielsen 1999, IMM-REP-1999-05). `on_step` gets w and
+    its cost at the start and after each step; False ends the search.
     """
-    w, damping = start, 1e-2
-    error, J = errors(w, True)
+    w, damping, growth = start, _FIRST_DAMPING, 2.0
+    J = np.empty((weight.size, start.size))
+    single = np.empty(J.shape, dtype=np.float32)
+    error = weight * errors(w, J)
 
     def total_cost(e: Vector, w: Vector) -> float:
         return float(e @ e + decay * (w @ w))
@@ -96,36 +110,37 @@ def levenberg(
     if not on_step(w, cost):
         return w
     for _ in range(iterations):
-        if J is None:
-            raise ValueError("`errors` returned no derivatives")
         # The step is damped by far more than single precision rounds, and takes half the time; its slope is exact.
-        single = J.astype(np.float32)
-        A, g = single.T @ single, J.T @ error - decay * w
-        trial, trial_cost = w, cost
-        # A cost that is not finite also shortens the step.
-        while not trial_cost < cost and damping < _MAX_DAMPING:
-            trial = w + _solve_damped(A, g, decay + damping)
-            trial_cost = total_cost(errors(trial, False)[0], trial)
-            damping *= _SHRINK if trial_cost < cost else _GROW
-        if not trial_cost < cost:
+        np.multiply(J, weight[:, None], out=single, casting="same_kind")
+        A, g = single.T @ single, J.T @ (weight * error) - decay * w
+        while damping < _MAX_DAMPING:
+            step = _solve_damped(A, g, decay + damping)
+            trial = w + step
+            trial_cost = total_cost(weight * errors(trial, None), trial)
+            if trial_cost < cost:
+                break
+            # A cost that is not finite also shortens the step.
+            damping, growth = damping * growth, 2.0 * growth
+        else:
             break
-        w, cost, damping = trial, trial_cost, max(damping, 1e-9)
+        gain = (cost - trial_cost) / float(step @ (g + damping * step))
+        damping, growth = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), _MIN_DAMPING), 2.0
+        w, cost = trial, trial_cost
         if not on_step(w, cost):
             break
-        error, J = errors(w, True)
+        error = weight * errors(w, J)
     return w
 
 
 def _solve_damped(A: Matrix, g: Vector, damping: float) -> Vector:
-    from scipy.linalg import LinAlgError, cho_factor, cho_solve
+    """Solve (A + damping I) x = g; zeros where it is not positive definite."""
+    from scipy.linalg.lapack import spotrf, spotrs
 
-    try:
-        damped = A.copy()
-        damped[np.diag_indices(g.size)] += damping
-        factor = cho_factor(damped, overwrite_a=True, check_finite=False)
-        return cho_solve(factor, g.astype(A.dtype), check_finite=False).astype(np.float64)
-    except LinAlgError:
-        return np.zeros_like(g)
+    damped = A.copy()
+    damped[np.diag_indices(g.size)] += damping
+    # A symmetric matrix is its own transpose, which LAPACK takes without a copy.
+    factor, failed = spotrf(damped.T, lower=1, clean=0, overwrite_a=1)
+    return np.zeros_like(g) if failed else spotrs(factor, g.astype(A.dtype), lower=1)[0].astype(np.float64)
 
 
 FUNCTIONS = "softneck.identification.networks._nn_fit_runtime"
@@ -338,16 +353,14 @@ def _series_parallel(
     """Minimise the weighted one-step errors over `rows`: regressors, targets and weights."""
     Z, target, weight = rows
 
-    def errors(w: Vector, derivatives: bool) -> tuple[Vector, Matrix | None]:
-        if not derivatives:
-            return weight * (target - start.like(w).output(Z)), None
-        output, J = jacobian(start.like(w), Z)
-        return weight * (target - output), weight[:, None] * J
+    def errors(w: Vector, J: Matrix | None) -> Vector:
+        layers = start.like(w)
+        return target - (layers.output(Z) if J is None else jacobian(layers, Z, J))
 
     def on_step(w: Vector, cost: float) -> bool:
         return best.update(start.like(w), cost, what)
 
-    return start.like(levenberg(errors, start.vector(), iterations=iterations, decay=decay, on_step=on_step))
+    return start.like(levenberg(errors, start.vector(), weight, iterations=iterations, decay=decay, on_step=on_step))
 
 
 def _train_windows(
@@ -358,24 +371,22 @@ def _train_windows(
     starts, h1, h2 = data.starts(length), start.b1.size, start.b2.size
     step = data.decimation
     there = np.isfinite(data.target[::step])
-    free = np.empty(data.target.size)
-    J = np.empty((there.size, start.vector().size))
-    Z, target = data.measured[rows], data.target[rows]
+    simulated, free = np.nan_to_num(data.target[::step]), np.empty(data.target.size)
+    Z, target, count = data.measured[rows], data.target[rows], there.size
     one_step = _ONE_STEP_WEIGHT if data.has_time_constant else 1.0
-    weight = np.concatenate([data.weight[::step][there], one_step * data.weight[rows]])
+    weight = np.concatenate([data.weight[::step] * there, one_step * data.weight[rows]])
 
-    def errors(w: Vector, derivatives: bool) -> tuple[Vector, Matrix | None]:
-        call = (w, h1, h2, data.simulated, data.lags, starts, data.shift, data.gain)
-        if not derivatives:
+    def errors(w: Vector, J: Matrix | None) -> Vector:
+        layers, call = start.like(w), (w, h1, h2, data.simulated, data.lags, starts, data.shift, data.gain)
+        if J is None:
             functions.nn_free(*call, free)
-            one, by_one = start.like(w).output(Z), None
+            one = layers.output(Z)
         else:
-            functions.nn_sensitivities(*call, step, free, J)
-            one, by_one = jacobian(start.like(w), Z)
-        error = weight * np.concatenate([(data.target - free)[::step][there], target - one])
-        return error, None if by_one is None else weight[:, None] * np.vstack([J[there], by_one])
+            functions.nn_sensitivities(*call, step, free, J[:count])
+            one = jacobian(layers, Z, J[count:])
+        return np.concatenate([simulated - free[::step], target - one])
 
     def on_step(w: Vector, cost: float) -> bool:
         return best.update(start.like(w), cost, f"windows of {length}")
 
-    return start.like(levenberg(errors, start.vector(), iterations=iterations, decay=decay, on_step=on_step))
+    return start.like(levenberg(errors, start.vector(), weight, iterations=iterations, decay=decay, on_step=on_step))

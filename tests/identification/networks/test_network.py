@@ -30,11 +30,17 @@ def casadi_output(w: casadi.SX, z: np.ndarray) -> casadi.SX:
     return casadi.dot(w[43:46], casadi.tanh(W2 @ h + w[40:43])) + w[46]
 
 
+def derivatives(net: Layers, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The outputs (rows,) and their derivatives by all weights (rows, weights)."""
+    J = np.full((len(inputs), net.vector().size), np.nan)
+    return jacobian(net, inputs, J), J
+
+
 def test_the_jacobian_is_that_of_casadi() -> None:
     w = casadi.SX.sym("w", 47)
     outputs = casadi.vertcat(*[casadi_output(w, z) for z in Z])
     value, derivative = casadi.Function("f", [w], [outputs, casadi.jacobian(outputs, w)])(NET.vector())
-    y, J = jacobian(NET, Z)
+    y, J = derivatives(NET, Z)
     # The same arithmetic in another order: tens of ulp of numbers of order one.
     np.testing.assert_allclose(y, np.array(value).ravel(), rtol=0, atol=1e-13)
     np.testing.assert_allclose(J, np.array(derivative), rtol=0, atol=1e-13)
@@ -47,7 +53,7 @@ def test_the_jacobian_is_that_of_central_differences() -> None:
         [(NET.like(w + h * e).output(Z) - NET.like(w - h * e).output(Z)) / (2 * h) for e in np.eye(w.size)]
     )
     # h^2 times third derivatives of order one, beside eps/h: 1e-10 and 2e-11.
-    np.testing.assert_allclose(jacobian(NET, Z)[1], numeric, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(derivatives(NET, Z)[1], numeric, rtol=0, atol=1e-8)
 
 
 def test_weights_survive_the_vector() -> None:
@@ -61,15 +67,15 @@ def trained(start: Layers, inputs: np.ndarray, target: np.ndarray, iterations: i
     """The cost after each step of a training by one-step errors."""
     costs: list[float] = []
 
-    def errors(w: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
-        output, J = jacobian(start.like(w), inputs)
-        return target - output, J if derivatives else None
+    def errors(w: np.ndarray, J: np.ndarray | None) -> np.ndarray:
+        layers = start.like(w)
+        return target - (layers.output(inputs) if J is None else jacobian(layers, inputs, J))
 
     def seen(_: np.ndarray, cost: float) -> bool:
         costs.append(cost)
         return True
 
-    levenberg(errors, start.vector(), iterations=iterations, decay=decay, on_step=seen)
+    levenberg(errors, start.vector(), np.ones(len(inputs)), iterations=iterations, decay=decay, on_step=seen)
     return costs
 
 
