@@ -134,13 +134,14 @@ def levenberg(
 
 def _solve_damped(A: Matrix, g: Vector, damping: float) -> Vector:
     """Solve (A + damping I) x = g; zeros where it is not positive definite."""
-    from scipy.linalg.lapack import spotrf, spotrs
+    from scipy.linalg import get_lapack_funcs
 
+    factorise, solve = get_lapack_funcs(("potrf", "potrs"), (A,))
     damped = A.copy()
     damped[np.diag_indices(g.size)] += damping
     # A symmetric matrix is its own transpose, which LAPACK takes without a copy.
-    factor, failed = spotrf(damped.T, lower=1, clean=0, overwrite_a=1)
-    return np.zeros_like(g) if failed else spotrs(factor, g.astype(A.dtype), lower=1)[0].astype(np.float64)
+    factor, failed = factorise(damped.T, lower=1, clean=0, overwrite_a=1)
+    return np.zeros_like(g) if failed else solve(factor, g.astype(A.dtype), lower=1)[0].astype(np.float64)
 
 
 FUNCTIONS = "softneck.identification.networks._nn_fit_runtime"
