@@ -9,7 +9,7 @@ import pytest
 
 from softneck import import_log
 from softneck.core import DataError, SettingsError, Vector
-from softneck.signals import columns_line, is_of_another_robot, read_recording, write_recording
+from softneck.signals import columns_line, guess_layout, is_of_another_robot, read_recording, write_recording
 from softneck.signals.importing._robot_guess import NamedColumns, RobotGuess, guess_robot, layout_for
 
 ROWS = 400
@@ -234,11 +234,26 @@ def test_units_of_a_robot_are_those_of_the_titles_and_doubted_where_they_are_amb
 
 
 @pytest.mark.parametrize("title", ["time_s", "time [s]", "t_s"])
-def test_a_clock_of_two_seconds_is_as_titled_and_doubted(tmp_path: Path, title: str) -> None:
-    guess = guess_robot(write(tmp_path / "log.csv", {title: 100.0 * TIME, "cmd [V]": A, "x [mm]": ONE}))
-    assert import_log(tmp_path / "log.csv", guess.layout).recording.sample_time == pytest.approx(2.0, rel=1e-6)
-    assert any(doubt.channels == ("time",) for doubt in guess.doubts)
-    assert sum("unusual sample time" in line for line in guess.lines) == 1
+@pytest.mark.parametrize(("sample_time", "doubted"), [(2.0, False), (10.0, False), (2e-4, True)])
+def test_a_robot_may_be_as_slow_as_the_title_of_its_clock_says(
+    tmp_path: Path, title: str, sample_time: float, doubted: bool
+) -> None:
+    time = sample_time / 0.02 * TIME
+    guess = guess_robot(write(tmp_path / "log.csv", {title: time, "cmd [V]": A, "x [mm]": ONE}))
+    # Six digits are written.
+    assert import_log(tmp_path / "log.csv", guess.layout).recording.sample_time == pytest.approx(sample_time, rel=1e-4)
+    assert any(doubt.channels == ("time",) for doubt in guess.doubts) == doubted
+    assert sum("unusual sample time" in line for line in guess.lines) == doubted
+
+
+def test_columns_in_millimetres_are_no_angles_of_a_neck(tmp_path: Path) -> None:
+    named = {f"Kanal {j} [mm]": values for j, values in enumerate((A, B, A - B, ONE, BENT), start=1)}
+    file = write(tmp_path / "log.csv", {"time [s]": TIME, **named})
+    guess = guess_layout(file)
+    assert not set(guess.layout.channels) & {"motor_setpoint_1", "motor_position_1", "pitch", "roll"}
+    assert guess.missing
+    file = write(tmp_path / "weg.csv", {"Zeit [s]": TIME, "Sollweg 1 [mm]": A, "Sollweg 2 [mm]": B, "x [m]": ONE})
+    assert guess_robot(file).robot.motors.names == ("Sollweg_1", "Sollweg_2")
 
 
 def test_names_keep_the_letters_under_accents_and_another_unit_is_the_reason(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ _GERMAN = {
     "neigung": "inclination", "richtung": "orientation", "strom": "current", "spannung": "voltage",
     "drehmoment": "torque", "moment": "torque", "kraft": "force", "temperatur": "temperature", "fehler": "error",
     "abweichung": "deviation", "regelabweichung": "deviation", "modell": "model", "versuch": "trial", "lauf": "run",
-    "messung": "experiment", "zeile": "row", "nummer": "index", "nr": "index",
+    "weg": "displacement", "hub": "stroke", "messung": "experiment", "zeile": "row", "nummer": "index", "nr": "index",
 }  # fmt: skip
 _SPANISH = {
     "tiempo": "time", "fecha": "time", "hora": "time", "consigna": "setpoint", "referencia": "reference",
@@ -193,7 +193,7 @@ def read_title(title: str) -> Title:
         unit = last
     found = Title(role, " ".join(names), motor, unit, why, rank, written)
     other = plain(written) in TEMPERATURES or found.quantity not in ("", "rad", "rad/s")
-    if other and role not in ("time", "run", "ignored", "unknown", "velocity"):
+    if other and role not in ("time", "run", "ignored", "velocity"):
         return replace(found, role="ignored", why=f"{written} is no unit of an angle")
     return found
 

@@ -85,9 +85,10 @@ class Pick:
 
 @dataclass(slots=True)
 class Draft:
-    """The state of a guess; `picks` also holds time, run, inclination and orientation."""
+    """The state of a guess; `picks` also holds time, run, inclination and orientation. `neck`: of the neck's log."""
 
     sniffed: SniffResult
+    neck: bool = True
     titles: dict[Column, Title] = field(default_factory=dict)
     moving: dict[Column, Vector] = field(default_factory=dict)
     picks: dict[str, Pick] = field(default_factory=dict)

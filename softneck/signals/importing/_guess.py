@@ -303,7 +303,9 @@ def guess_clock(table: SniffResult, taken: Collection[Column]) -> tuple[Layout, 
 
     `taken`: columns that are motors or outputs.
     """
-    draft = Draft(replace(table, columns={name: x for name, x in table.columns.items() if name not in taken}))
+    draft = Draft(
+        replace(table, columns={name: x for name, x in table.columns.items() if name not in taken}), neck=False
+    )
     by_names(draft)
     pick_clock(draft)
     found = units(draft)

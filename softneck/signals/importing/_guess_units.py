@@ -174,16 +174,16 @@ def _time(draft: Draft, found: dict[str, Unit]) -> None:
         pick = draft.picks["time"]
         dates = pick.terms[0].column in draft.sniffed.dates
         found["time"] = Unit(DATE, 1.0, "it holds dates or times of day") if dates else clock_unit(
-            draft.values("time"), pick.unit
+            draft.values("time"), pick.unit, neck=draft.neck
         )  # fmt: skip
 
 
-def clock_unit(values: Vector, titled: str | None) -> Unit:
-    """Return the unit of a clock (time,) whose title names the unit `titled` or none."""
+def clock_unit(values: Vector, titled: str | None, *, neck: bool) -> Unit:
+    """Return the unit of a clock (time,) whose title names the unit `titled` or none; `neck`: of the neck's log."""
     step = np.diff(values)
     typical = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
     if titled is not None:
-        return _doubted_clock(Unit(titled, 1.0, f"its title says {titled}"), typical)
+        return _doubted_clock(Unit(titled, 1.0, f"its title says {titled}"), typical, neck=neck)
     if is_serial_days(values):
         why = "it counts days, as a spreadsheet or `datenum` does (a day has 86,400 s)"
         return Unit("days", 1.0, why, _DAYS_CONFIDENCE)
@@ -196,10 +196,13 @@ def clock_unit(values: Vector, titled: str | None) -> Unit:
     return Unit(name, 1.0, f"its steps of {typical:.4g} are a sample time only in {name}", sure)
 
 
-def _doubted_clock(unit: Unit, typical: float) -> Unit:
-    """Doubt a title whose sample time is far from usual; take another reading if it is impossible."""
+def _doubted_clock(unit: Unit, typical: float, *, neck: bool) -> Unit:
+    """Doubt a title whose sample time is far from usual; take another reading if it is impossible.
+
+    A robot that is no neck may be as slow as its title says, such as a heated one.
+    """
     step = max(typical * unit.si, 1e-9)
-    if _USUAL_STEP_S / _FAR_STEP <= step <= _USUAL_STEP_S * _FAR_STEP:
+    if _USUAL_STEP_S / _FAR_STEP <= step <= (_USUAL_STEP_S * _FAR_STEP if neck else _STEP_BOUNDS_S[1]):
         return unit
     others = {name: typical * to_si(name)[0] for name in _TITLED_CLOCKS if name != unit.name}
     other = min(others, key=lambda name: abs(log(max(others[name], 1e-300) / _USUAL_STEP_S)))

@@ -348,7 +348,7 @@ def _layout(
     if roles.time is not None:
         named, dates = table.title(roles.time), roles.time in table.dates
         titled = named.unit if named.quantity == "s" else None
-        unit = Unit(DATE, 1.0, "") if dates else clock_unit(table.columns[roles.time], titled)
+        unit = Unit(DATE, 1.0, "") if dates else clock_unit(table.columns[roles.time], titled, neck=False)
         time = Source((Term(roles.time, unit.factor),), unit.name)
         doubts = [Doubt("clock", ("time",), unit.name, unit.confidence, unit.why)] if unit.confidence < SURE else []
     elif sample_time is not None:
