@@ -84,5 +84,6 @@ def load_for_robot(thing: Any, role: str | None = None, robot: str | Path | Robo
     given = find_robot(robot, beside=path)
     if given.hash != own.hash:
         raise DataError(f"{path or 'it'}: is of robot {own.label()}, not of {given.label()}.")
+    given = given.with_rest(own.motors.rest, own.outputs.rest)
     # A controller keeps its limits, as it was designed for them.
     return replace(found, robot=given) if "robot" in (field.name for field in fields(found)) else found

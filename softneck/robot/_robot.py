@@ -267,6 +267,13 @@ class Robot(ReprMixin):
             raise SettingsError(f"the directions of {self.label()} are to be identified; use a model of it.")
         return redefinition_of(own, self.outputs.names)
 
+    def with_rest(self, motors: Sequence[float] | None, outputs: Sequence[float] | None) -> Robot:
+        """Return the robot with `rest` of motors and outputs, each in its unit, where it gives none."""
+        given = {"motors": motors, "outputs": outputs}
+        new = {name: replace(getattr(self, name), rest=tuple(rest)) for name, rest in given.items()
+               if rest is not None and getattr(self, name).rest is None}  # fmt: skip
+        return replace(self, **new) if new else self
+
     def in_header(self) -> dict[str, Any]:
         """Return the robot's entry in the header of a model's file; empty for the preset `neck`."""
         table = self.as_dict()

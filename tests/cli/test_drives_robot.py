@@ -62,6 +62,19 @@ def test_check_says_which_limits_hold_for_the_robot_beside_the_drives_file(call:
     assert found[0, "bus load"] == "7 % of 1e+06 bit/s at worst"
 
 
+@pytest.mark.usefixtures("files")
+def test_without_a_drives_file_the_robot_is_that_of_the_working_folder(call: Call) -> None:
+    said = call("drives", "check", "--simulated", "--json")
+    assert said.code == 0, said
+    assert "robot: bench, from robot.toml" in said.err
+    # Its drives file, with two nodes.
+    assert {row["node"] for row in json.loads(said.out)["rows"]} == {0, 11, 12}
+    Path("robot.toml").write_text(ROBOT.replace("[motors]", '[motors]\nunit = "psi"'), encoding="utf-8")
+    said = call("drives", "commission", "--simulated")
+    assert said.code == 2
+    assert "has motors in psi; drives turn winches" in said.err
+
+
 @pytest.mark.parametrize(("old", "new", "line"), [
     ("reversed = true", "reversed = false", "[[drive]] 2 has reversed = false, but `motors.sign` of motor 2 is -1"),
     ("[[drive]]\nnode = 12\npeak_current_A = 10.0\nreversed = true\n", "", "two [[drive]] tables are needed for robot"),

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tomli_w
 
 from softneck import identify, load, validate
 from softneck.core import DataError, FileFormatError, Matrix, SettingsError
 from softneck.identification import FamilySettings, choose
 from softneck.identification.models._directions import directions_of
-from softneck.robot import Robot
+from softneck.robot import Robot, load_for_robot
 from softneck.signals import Recording
 
 from ..data import slow_but
@@ -282,6 +283,23 @@ def test_models_and_recordings_of_two_robots_are_not_mixed() -> None:
         model.simulate(recorded(ROBOTS["antagonist"]))
     with pytest.raises(DataError, match="of two robots"):
         model.initial_state(recorded(ROBOTS["trunk4"]))
+
+
+def test_a_robot_whose_set_points_have_one_sign_rests_at_the_mean_of_its_data(tmp_path: Path) -> None:
+    seen = recorded(ROBOTS["bellows"], rest=0.3)
+    pressed = seen.with_channels(**{name: seen.channels[name] + 3.0 for name in seen.robot.set_points})
+    assert identify("oe", seen, train=1.0, delay=0.06).robot.motors.rest is None
+    model, family = identify("oe", pressed, train=1.0, delay=0.06), FamilySettings().fit(pressed)
+    for robot in (model.robot, family.robot):
+        assert robot.motors.rest == pytest.approx(pressed.set_points.mean(axis=0) / 1e5, rel=1e-5)  # six digits
+        assert robot.outputs.rest == pytest.approx(pressed.outputs.mean(axis=0) / 1e-3, rel=1e-5)
+    # A robot file without `rest` leaves the model's, another one decides.
+    model.save(tmp_path / "m.npz")
+    (tmp_path / "robot.toml").write_text(tomli_w.dumps(BELLOWS), encoding="utf-8")
+    assert load_for_robot(tmp_path / "m.npz").robot.motors.rest == model.robot.motors.rest
+    own = BELLOWS | {"motors": BELLOWS["motors"] | {"rest": 2e-5}}
+    (tmp_path / "robot.toml").write_text(tomli_w.dumps(own), encoding="utf-8")
+    assert load_for_robot(tmp_path / "m.npz").robot.motors.rest == (2e-5,) * 4
 
 
 def test_a_transfer_function_is_of_the_direction_or_of_a_motor() -> None:

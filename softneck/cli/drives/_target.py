@@ -120,8 +120,13 @@ class Asked:
                 raise SettingsError("--pace is for --simulated; a bus runs in real time.")
 
     def target(self) -> Target:
-        """Return which drives are meant."""
-        return target_of(self.drives, self.bus, self.simulated, self.arm, robot=self.robot)
+        """Return which drives are meant; without a drives file the robot may be that of the working folder."""
+        from softneck.robot import ROBOT_FILE, find_robot, robot_file_of
+
+        robot: Any = self.robot
+        if robot is None and self.drives is None and robot_file_of(ROBOT_FILE) is not None:
+            robot = find_robot(beside=ROBOT_FILE)
+        return target_of(self.drives, self.bus, self.simulated, self.arm, robot=robot)
 
 
 def drives_options(*more: str) -> Callable[[Callable], Callable]:

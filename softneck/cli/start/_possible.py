@@ -120,8 +120,8 @@ def propose_missing(file: Path, recordings: Sequence[Recording], *, motors: bool
         "rate_hz": (_digits(1.0 / recordings[0].sample_time), 80, "one measurement a sample of the recordings"),
     }
     proposed: list[str] = []
-    limits, (motor_rest, output_rest) = _limits(robot, recordings) if motors else {}, _rest(robot, recordings)
-    for name, found in (("motors", limits | motor_rest), ("outputs", output_rest), ("sensor", sensor)):
+    limits = _limits(robot, recordings) if motors else {}
+    for name, found in (("motors", limits), ("sensor", sensor)):
         missing = {key: entry for key, entry in found.items() if key not in told.get(name, {})}
         if missing:
             _add(file, name, missing)
@@ -129,24 +129,6 @@ def propose_missing(file: Path, recordings: Sequence[Recording], *, motors: bool
             note(f"not sure: {file} lacks values of {name}: {said} from the recordings; correct them there")
         proposed += missing
     return proposed
-
-
-def _rest(robot: Robot, recordings: Sequence[Recording]) -> tuple[dict[str, Entry], dict[str, Entry]]:
-    """Return set-points and outputs at the middle of the recordings, where loops and steps of a robot are tried.
-
-    What tendons bend rests at zero; so does a robot whose set-points have both signs.
-    """
-    set_points = np.concatenate([recording.set_points for recording in recordings])
-    if robot.tendon_angles is not None or (set_points.min() < 0.0 < set_points.max()):
-        return {}, {}
-    outputs = np.concatenate([part.outputs for part in recordings])
-    if not np.isfinite(outputs).any(axis=0).all():
-        return {}, {}
-    means = np.mean(set_points, axis=0), np.nanmean(outputs, axis=0)
-    units = to_si(robot.motors.unit)[0], to_si(robot.outputs.unit)[0]
-    found = [[_digits(value / unit) for value in mean] for mean, unit in zip(means, units, strict=True)]
-    motors, outputs = (f"the mean of the {what}: steps of tests start there" for what in ("set-points", "outputs"))
-    return {"rest": (found[0], 60, motors)}, {"rest": (found[1], 60, outputs)}
 
 
 def _add(file: Path, name: str, entries: dict[str, Entry]) -> None:

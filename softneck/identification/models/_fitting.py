@@ -198,6 +198,19 @@ def sensor_noise(recording: Recording) -> list[float]:
     return found
 
 
+def robot_at_rest(recording: Recording) -> Robot:
+    """Return the robot of a recording; where it gives no `rest`, that is the mean of set-points and outputs.
+
+    Steps and loops of tests start there. What tendons bend rests at zero; so does a robot whose set-points have both
+    signs.
+    """
+    robot, P = recording.robot, recording.set_points
+    if robot.tendon_angles is not None or P.min() < 0.0 < P.max():
+        return robot
+    means = (P.mean(axis=0), robot.motors.unit), (np.nanmean(recording.outputs, axis=0), robot.outputs.unit)
+    return robot.with_rest(*([float(f"{x:.6g}") for x in mean / to_si(unit)[0]] for mean, unit in means))
+
+
 def fitted_model(
     kind: str,
     settings: DataclassInstance,
@@ -214,7 +227,7 @@ def fitted_model(
         settings=asdict(settings),
         findings={**findings, **trained_set_points(recording), "sensor": {"noise_std": sensor_noise(recording)}},
         training_rows=row_hashes(recording),
-        robot=recording.robot,
+        robot=robot_at_rest(recording),
     )
     return with_validity_region(model, recording)
 

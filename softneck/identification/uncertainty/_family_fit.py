@@ -27,7 +27,7 @@ from softneck.signals import Recording, concatenate, conditions
 from ..linear._oe import SOURCES
 from ..linear._srivc_fit import Continuous, SrivcFitOptions
 from ..models._directions import Directions
-from ..models._fitting import MAX_DELAY, ScaledData, check_training
+from ..models._fitting import MAX_DELAY, ScaledData, check_training, robot_at_rest
 from ._family import SCOPES, AxisFamily, Family, one_pole, relative_errors
 from ._local_models import Local, Window, axis_inputs, fit_compression, fit_local, unit_response, windows
 from ._measured import (
@@ -250,7 +250,7 @@ class FamilySettings:
         return replace(
             found,
             sample_time=whole.sample_time,
-            robot=whole.robot,
+            robot=robot_at_rest(whole),
             settings=asdict(self) | {key: scaling.second * (value or 0.0) for key, value in times.items()},
             findings={**found.findings, "tested": tested, **data.findings()},
         )

@@ -32,7 +32,7 @@ from softneck.signals import Recording, concatenate
 
 from ..models._arrays import COMPOSED, memory_of, prefixed_arrays, trained_set_points, within
 from ..models._directions import NECK_SECONDS, time_constant_of
-from ..models._fitting import row_hashes, training_recording
+from ..models._fitting import robot_at_rest, row_hashes, training_recording
 from ..models._model import WARM_UP, Model
 from ..models._validity import with_validity_region
 from ..networks._network import Network
@@ -273,7 +273,7 @@ class Guarded:
             settings=asdict(replace(self, base=base.model.kind, workers=None)),
             findings=findings,
             training_rows=row_hashes(recording),
-            robot=robot,
+            robot=robot_at_rest(recording),
         )
         return with_validity_region(model, recording)
 

@@ -10,7 +10,7 @@ import pytest
 
 from softneck.cli.start import _possible, _start
 from softneck.cli.start._possible import propose_missing
-from softneck.core import OutputFileError, to_si
+from softneck.core import OutputFileError
 from softneck.fmu.compiled import _library
 from softneck.robot import Robot
 from softneck.signals import Recording
@@ -101,22 +101,6 @@ def test_a_disk_that_is_nearly_full_is_said_before_anything_is_made(
     with pytest.raises(OutputFileError, match="only 12 MB are free there, a project takes up to 50 MB"):
         _possible.require_disk(tmp_path / "a" / "b")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_robot_whose_set_points_are_of_one_sign_is_tried_at_the_mean_of_its_recordings(tmp_path: Path) -> None:
-    file = tmp_path / "robot.toml"
-    file.write_text(ROBOT, encoding="utf-8")
-    seen = recorded(file)
-    (name,) = seen.robot.set_points
-    moved = {name: seen.channels[name] + 2e5, "x": seen.channels["x"] + 0.02}
-    pressed = seen.with_channels(**moved)
-    assert "rest" not in propose_missing(file, [seen], motors=False)
-    assert propose_missing(file, [pressed], motors=False) == ["rest", "rest"]
-    robot = Robot.read(file)
-    unit = to_si(robot.motors.unit)[0]
-    # Three digits are written.
-    assert robot.motors.rest == pytest.approx((pressed.set_points.mean() / unit,), rel=5e-3)
-    assert robot.outputs.rest == pytest.approx((pressed.outputs.mean() / 1e-3,), rel=5e-3)
 
 
 @pytest.mark.parametrize(("second", "least", "most"), [(1.05, 0.0, 105.0), (1.5, [0.0, 0.0], [100.0, 150.0])])
