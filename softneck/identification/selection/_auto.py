@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -137,6 +138,21 @@ def _failure_reasons(ranking: Sequence[KindTrial]) -> str:
     return "; ".join(f"{', '.join(kinds)}: {why}" for why, kinds in said.items())
 
 
+_INTERNAL = "internal error in softneck"
+
+
+def _reason(error: Exception) -> str:
+    """Return why a kind was not identified. What is no fault of the data is an internal error, which says so.
+
+    It ends the choice where SOFTNECK_TRACEBACK asks where it comes from.
+    """
+    if isinstance(error, NOT_FITTED):
+        return str(error)
+    if os.environ.get("SOFTNECK_TRACEBACK"):
+        raise error
+    return f"{_INTERNAL}: {type(error).__name__}: {error} (set SOFTNECK_TRACEBACK=1 and report what it prints)"
+
+
 def _progress_text(kind: str, tried: list[KindTrial]) -> str:
     """Return the kind being tried and the best so far."""
     best = max(tried, key=lambda one: one.fit, default=None)
@@ -189,6 +205,7 @@ def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[st
     failed = [one.kind for one in ranking if one.fit == float("-inf")]
     if failed:
         remarks.append(f"Not identified or diverged: {', '.join(failed)}.")
+    remarks += [f"{one.kind}: {one.failure}" for one in ranking if one.failure.startswith(_INTERNAL)]
     return tuple(remarks)
 
 
@@ -340,8 +357,8 @@ class _Race:
             model = self._short(kind, fold)
             seconds = time.perf_counter() - begin
             found = {part.name: part.fits(model) for part in (*fold.judged, all_rows(HOLD_OUT, self.hold_out))}
-        except NOT_FITTED as error:  # one kind never ends the search
-            self.tried[kind] = KindTrial(kind, time.perf_counter() - begin, failure=str(error))
+        except Exception as error:  # one kind never ends the search
+            self.tried[kind] = KindTrial(kind, time.perf_counter() - begin, failure=_reason(error))
             return
         self.tried[kind] = _with(KindTrial(kind, seconds, model, whole=False), found)
 
@@ -380,15 +397,15 @@ class _Race:
         return bool(found)
 
     def _leave_out(self, kind: str, fold: Fold) -> None:
-        begin = time.perf_counter()
+        one, begin = self.tried[kind], time.perf_counter()
+        why = one.failure
         try:
             model = self._short(kind, fold)
             found = {part.name: part.fits(model) for part in fold.judged}
-        except NOT_FITTED:  # one kind never ends the search
+        except Exception as error:  # one kind never ends the search
             lost = dict.fromkeys(fold.train.robot.outputs.names, float("-inf"))
-            found = {part.name: (lost, float("nan")) for part in fold.judged}
-        one = self.tried[kind]
-        self.tried[kind] = _with(replace(one, seconds=one.seconds + time.perf_counter() - begin), found)
+            found, why = {part.name: (lost, float("nan")) for part in fold.judged}, _reason(error)
+        self.tried[kind] = _with(replace(one, seconds=one.seconds + time.perf_counter() - begin, failure=why), found)
 
     def train_best(self, progress: Progress) -> KindTrial:
         """Leave the next part out of the best kind, or train it on all rows, until the best is through; return it.
@@ -444,8 +461,8 @@ class _Race:
                 parts = [best.model, self._short(best.kind, self.folds[0])]
                 model = replace(settings, members=len(parts)).around(base, parts, self.train)
             judged, (examination, model) = self._validate("guarded", model), self._examined(best.kind, model)
-        except NOT_FITTED as error:  # one kind never ends the search
-            self.tried["guarded"] = KindTrial("guarded", time.perf_counter() - begin, failure=str(error))
+        except Exception as error:  # one kind never ends the search
+            self.tried["guarded"] = KindTrial("guarded", time.perf_counter() - begin, failure=_reason(error))
             return best
         seconds = time.perf_counter() - begin
         one = replace(
@@ -467,8 +484,8 @@ class _Race:
             examination, model = self._examined(kind, self._fitted(kind))
             judged = self._validate(kind, model)
             error = all_rows(HOLD_OUT, self.hold_out).fits(model)[1]
-        except NOT_FITTED as error:  # one kind never ends the search
-            return KindTrial(kind, one.seconds, failure=str(error))
+        except Exception as error:  # one kind never ends the search
+            return KindTrial(kind, one.seconds, failure=_reason(error))
         one = replace(one, seconds=one.seconds + time.perf_counter() - begin, errors={**one.errors, HOLD_OUT: error})
         return replace(one, model=model, judged=judged, whole=True, examination=examination)
 

@@ -29,7 +29,7 @@ from ..models._validity import calibrate_validity
 HOLD_OUT, SECOND = "hold-out", "second training"
 OF_ONE_MOTION = ("largest motions", "fastest motions", "later block", SECOND)
 Fits = Mapping[str, float]
-# What a fit raises where the data determine no model; whatever else it raises is a fault of ours, and not hidden.
+# What a fit raises where the data determine no model; whatever else it raises is a fault of ours, which is said.
 NOT_FITTED = (SoftneckError, np.linalg.LinAlgError)
 # Cheaper settings of the same method: fewer starts and steps.
 SHORT: dict[str, dict[str, Any]] = {

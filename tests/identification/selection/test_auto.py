@@ -106,13 +106,20 @@ def test_a_hold_out_of_the_same_excitation_and_a_hopeless_one_are_remarked() -> 
     assert any("No kind reaches 70 %" in remark for remark in lost.remarks)
 
 
-def test_an_internal_error_of_one_kind_ends_the_choice(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It was shown as a kind that the data do not determine, and nobody reported it."""
+def test_an_internal_error_of_one_kind_is_said_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is not shown as a kind that the data do not determine, which nobody would report."""
 
     def fit(*_: object, **__: object) -> Model:
         raise IndexError("index 2 is out of bounds")
 
     monkeypatch.setattr(OutputError, "fit", fit)
+    monkeypatch.delenv("SOFTNECK_TRACEBACK", raising=False)
+    found = choose(TRAIN, OTHER, kinds=("rls", "oe"), other_excitation=True)
+    said = "internal error in softneck: IndexError: index 2 is out of bounds (set SOFTNECK_TRACEBACK=1 and report"
+    assert found.chosen.kind == "rls"
+    assert {one.kind: one.failure.startswith(said) for one in found.ranking} == {"rls": False, "oe": True}
+    assert any(remark.startswith(f"oe: {said}") for remark in found.remarks)
+    monkeypatch.setenv("SOFTNECK_TRACEBACK", "1")
     with pytest.raises(IndexError, match="index 2"):
         choose(TRAIN, OTHER, kinds=("rls", "oe"), other_excitation=True)
 
