@@ -156,7 +156,7 @@ def _print(path: Path, found: verification.Verification, folder: Path) -> None:
         for row in filter(lambda row: row["motion"] > 0.0, part.draws.coverage):  # files of before have such rows
             click.echo(
                 f"draws cover {100.0 * row['covered']:.0f} % of {row['class']} held-out motions, by a band of "
-                f"+-{100.0 * row['width'] / row['motion']:.0f} % of the motion"
+                f"+-{part.draws.band_of(row)} of the motion"
             )
     for name, why in found.evidence.not_computed.items():
         click.echo(f"not computed: {name}: {why}")

@@ -115,7 +115,8 @@ REQUIREMENTS = """version = 1
 [sampling]
 plants = 12
 search_generations = 0
-[neck]
+[sim]
+decides = true  # here the neck is the preset
 necks = 1
 payloads_kg = [0.0]
 [require]

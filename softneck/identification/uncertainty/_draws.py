@@ -144,6 +144,12 @@ class Draws(ReprMixin):
         wide = large["width"] / max(large["motion"], 1e-300)
         return f"they differ by +-{100.0 * wide:.0f} % of {large['class']} motions" if wide > _WIDE else ""
 
+    @staticmethod
+    def band_of(row: Mapping[str, Any]) -> str:
+        """Return how wide the band of a row of `coverage` is, in % of its motion."""
+        share = 100.0 * row["width"] / max(row["motion"], 1e-300)
+        return f"{share:.0f} %" if share >= 1.0 else f"{share:.1g} %"
+
     def summary(self, shown: float, unit: str) -> list[str]:
         """Return lines on the draws; `shown` converts outputs from SI to `unit`."""
         lines = [
@@ -155,7 +161,7 @@ class Draws(ReprMixin):
             lines.append(
                 f"  {row['class']} motions (held out, to {shown * row['motion']:.3g} {unit}): "
                 f"{100.0 * row['covered']:.0f} % within +-{shown * row['width']:.2g} {unit}, "
-                f"{100.0 * row['width'] / max(row['motion'], 1e-300):.0f} % of the motion"
+                f"{self.band_of(row)} of the motion"
             )
         return [*lines, f"caution: draws decide little, as {self.doubt}; record more"] if self.doubt else lines
 

@@ -119,6 +119,9 @@ _NO_UNITS = {"", "-", "1", "counts", "count", "ticks", "inc", "lsb", "raw", "a.u
 _CAPITAL = re.compile(r"[_ ]([mku]?[VAN]|[mk]?W|[mk]?Nm|Pa|kPa|hPa|MPa|mmHg|degC|°C?)$")
 # `setpoint / rad`, as DIN 1313 writes units of axes.
 _SLASH = re.compile(r"\s/\s*(\S+)\s*$")
+# `F/N` and `t/s`, or a whole unit as in `speed mm/s`; with another slash it is a path, such as `/motor/m`.
+_TIGHT_SLASH = re.compile(r"[^/]*?(([^/\s]+)/([^/\s]+))")
+_ONE_LETTER = set("VANKsm°%")
 # `Druck in bar`; `end in mind` names no unit.
 _IN = re.compile(r"\s+in\s+(.+?)\s*$")
 _BRACKET = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
@@ -210,6 +213,11 @@ def _without_unit(title: str) -> tuple[str, str]:
     said = _IN.search(title)
     last = said if said is not None and spelled_unit(said[1]) else _CAPITAL.search(title)
     match = _BRACKET.search(title) or _SLASH.search(title) or last
+    if (tight := _TIGHT_SLASH.fullmatch(title)) is not None:
+        if tight.start(1) and spelled_unit(tight[1]):
+            return title[: tight.start(1)], tight[1]
+        if tight[3] in _ONE_LETTER or (len(tight[3]) > 1 and spelled_unit(tight[3])):
+            return title[: tight.start(3) - 1], tight[3]
     if match is None or _INDEX.fullmatch(match[1].strip()):
         return title, ""
     text = match[1].strip()

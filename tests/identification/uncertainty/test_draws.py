@@ -560,6 +560,7 @@ def test_a_search_sees_its_own_draws_and_no_more(made: Callable[..., Draws]) -> 
     assert len(rows) == len(found.coverage)
     row = found.coverage[-1]
     assert f"{100.0 * row['width'] / row['motion']:.0f} % of the motion" in rows[-1]
+    assert found.band_of({"width": 2e-5, "motion": 0.01}) == "0.2 %"
 
 
 def test_the_making_of_draws_says_how_far_it_is_and_refuses_what_has_no_simulation(
