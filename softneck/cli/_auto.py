@@ -40,7 +40,7 @@ def identify_auto(
     as_json: bool,
 ) -> None:
     """Try the kinds, save the chosen model, and explain."""
-    path, overwrite = target(output, "models/auto.npz", force=force)
+    path, overwrite = target(output, "models/auto.npz", force=force, ending=".npz")
     # Linear kinds are what `design` and `observer` take; the best of the others is the better plant for loops.
     beside = {name: path.with_name(f"{path.stem}_{name}.npz") for name in _OTHER}
     for file in (path, *beside.values()):

@@ -66,7 +66,7 @@ def command(
     from softneck.identification import family as made_family
 
     chosen = apply_settings(identification.FamilySettings, settings)
-    path, replace = target(output, "families/family.npz", force=force)
+    path, replace = target(output, "families/family.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)

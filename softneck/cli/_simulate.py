@@ -229,6 +229,8 @@ def study_command(
     cosim.require_trusted(study_file, trust=trust)
     study = cosim.load_study(study_file)
     folder = output if output is not None else Path("build") / "studies" / study_file.stem
+    if folder.is_file():
+        raise SettingsError(f"{folder}: is a file; name a folder.")
     with progress(f"study of {len(study.points)} runs", quiet=as_json) as report:
         # Under build/ another study is replaced.
         other = output is None and (folder / cosim.STUDY_FILE).is_file()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import json
 import os
 from collections.abc import Callable
@@ -76,8 +77,9 @@ def test_recordings_of_two_sample_times_are_named(call: Call, tmp_path: Path) ->
 
 def test_a_model_under_another_ending_is_refused_before_any_work(call: Call, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("never read")
-    for name in ("m.csv", "m"):
-        said = call("identify", "rls", "a.csv", "-o", name, "--json")
+    makers = (("identify", "rls"), ("identify", "auto"), ("family",))
+    for maker, name in itertools.product(makers, ("m.csv", "m")):
+        said = call(*maker, "a.csv", "-o", name, "--json")
         refused(said, f"{name}: must end in `.npz`, by which softneck recognises the file", tmp_path, {"a.csv"})
 
 

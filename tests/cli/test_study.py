@@ -81,6 +81,12 @@ def test_a_study_s_table_names_what_varied(call: Call, project: Path) -> None:
     assert call("study", "study.toml", "-o", "out", "--workers", "0", "--force").code == 0
 
 
+def test_a_file_where_the_folder_should_be_is_refused_before_the_runs(call: Call, project: Path) -> None:
+    said = call("study", "study.toml", "-o", "loop.toml", "--workers", "0")
+    assert (said.code, said.error) == (2, "softneck: loop.toml: is a file; name a folder.")
+    assert not (project / "build").exists()
+
+
 def test_info_knows_a_study(call: Call, project: Path) -> None:
     facts = json.loads(call("info", "study.toml", "--json").out)
     assert (facts["type"], facts["runs"]) == ("study", 12)

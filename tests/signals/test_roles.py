@@ -256,6 +256,14 @@ def test_columns_in_millimetres_are_no_angles_of_a_neck(tmp_path: Path) -> None:
     assert guess_robot(file).robot.motors.names == ("Sollweg_1", "Sollweg_2")
 
 
+def test_a_unit_behind_a_tight_slash_is_read_as_in_brackets(tmp_path: Path) -> None:
+    file = write(tmp_path / "log.csv", {"t/s": TIME, "I_soll/A": A, "F/N": ONE, "tip mm/s": NOISE[0]})
+    guess = guess_robot(file)
+    assert (guess.robot.motors.names, guess.robot.motors.unit) == (("I_soll",), "A")
+    assert (guess.robot.outputs.names, guess.robot.outputs.unit) == (("F",), "N")
+    assert import_log(file, guess.layout).recording.sample_time == pytest.approx(0.02)
+
+
 def test_names_keep_the_letters_under_accents_and_another_unit_is_the_reason(tmp_path: Path) -> None:
     columns = {"time [s]": TIME, "Düse [V]": A, "Krümmung [mm]": ONE, "x [mm]": BENT, "twist [deg]": TURNED}
     guess = guess_robot(write(tmp_path / "log.csv", columns))
