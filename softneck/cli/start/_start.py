@@ -39,7 +39,9 @@ _PATH = click.Path(path_type=Path)
 _CERTIFICATE_FILE = "tune/best.certificate.json"
 _NEXT_RECORDING = "Record 60 s of `mixed` and start with that."
 # Of a robot that no virtual neck stands for: its own software plays the signal.
-_NEXT_STEPS = "Record steps of every motor, each held until the outputs settle, and start with that."
+_STEPS = "steps of every motor, each held until the outputs settle"
+_NEXT_STEPS = f"Record {_STEPS}, and start with that."
+_MOTION = "`softneck record mixed`, `softneck drives record mixed`"
 _MIXED_ADVICE = (
     "in `mixed` every motor moves by itself and all move together: `softneck drives record mixed` plays it on drives"
 )
@@ -49,8 +51,8 @@ _OWN_REQUIREMENTS = (
     "for requirements of your own see `softneck tune --print-requirements`, and pass them by --requirements"
 )
 _SECOND_VISIT = (
-    "to accept that: --requirements {folder}/tune/requirements.toml; to have more: record another motion (`softneck "
-    "record mixed`, `softneck drives record mixed`) and start with both logs, as more motions leave fewer models"
+    "to accept that: --requirements {folder}/tune/requirements.toml; to have more: record another motion ({motion}) "
+    "and start with both logs, as more motions leave fewer models"
 )
 # A common position [rad of a neck] at which a PI on five of the six necks of the tests rises within 0.34 s, in 0.74 to
 # 1.0 s without; at two thirds of it `column` still has slack tendons.
@@ -206,8 +208,13 @@ def _with_advice(error: SoftneckError, run: ProjectRun, folder: Path, logs: tupl
 
 
 def _next_recording() -> str:
-    given = Path("robot.toml")
-    return _NEXT_STEPS if given.is_file() and not has_own_tendons(Robot.read(given)) else _NEXT_RECORDING
+    return _NEXT_RECORDING if _plays_signals("") else _NEXT_STEPS
+
+
+def _plays_signals(folder: str) -> bool:
+    """Return whether `softneck record` plays signals on the robot of the project."""
+    given = Path(folder, "robot.toml")
+    return not given.is_file() or has_own_tendons(Robot.read(given))
 
 
 def _without(said: str) -> str:
@@ -363,7 +370,7 @@ def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
         for metric, one in facts["loosened"].items():
             click.echo(f"all holds but {Loosened(**one).in_words(metric)}")
         if facts["loosened"]:
-            click.echo(_SECOND_VISIT.format(folder=folder))
+            click.echo(_SECOND_VISIT.format(folder=folder, motion=_MOTION if _plays_signals(folder) else _STEPS))
         for line in (*facts["draws"], *(f"{what}: {how}" for what, how in facts["judged_elsewhere"].items())):
             click.echo(line)
         for doubt in (one for found in facts["doubts"].values() for one in found):

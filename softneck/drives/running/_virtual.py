@@ -92,7 +92,7 @@ def physics_of(robot: Robot, neck: NeckParameters | None = None) -> NeckParamete
 
 def stand_in(file: DrivesFile, neck: NeckParameters | None) -> str:
     """Return the note on simulated drives without virtual plant; "" for others."""
-    if physics_of(file.moves, neck) is not None:
+    if physics_of(file.moves, neck) is not None or file.moves.weights() is None:
         return ""
     gain, pole = file.watch.gain, file.watch.pole
     return (
