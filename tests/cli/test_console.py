@@ -37,6 +37,19 @@ def test_a_table_shows_every_character_of_title_heading_and_cells(title: str, na
         assert line.count(cell) >= 2
 
 
+@pytest.mark.parametrize("columns", ["40", "80", "200"])
+def test_a_narrow_terminal_shows_every_word_of_a_table(monkeypatch: pytest.MonkeyPatch, columns: str) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    out = io.StringIO()
+    monkeypatch.setattr(out, "isatty", lambda: True)
+    rows = [["play", "95.7 +- 0.2", "largest motions", "chosen"],
+            ["greybox", "-", "-", "not identified: kind `greybox` has motors in rad or deg"]]  # fmt: skip
+    with contextlib.redirect_stdout(out):
+        print_table("fit", ["kind", "worst", "of", ""], rows)
+    for word in " ".join(cell for row in rows for cell in row).split():
+        assert word in out.getvalue()
+
+
 @pytest.mark.parametrize("unit", ["rad", "deg", "N", "s", "kg m^2", "rad/s", "%", "-", "1/s", "/", "bold", "red"])
 def test_units_in_brackets_survive_in_every_place(unit: str) -> None:
     text = f"pulled [{unit}]"

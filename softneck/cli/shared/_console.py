@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import sys
 import time
@@ -36,14 +37,16 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) 
     from rich.text import Text
 
     table = Table(header_style="bold", pad_edge=False)
-    for index, name in enumerate(head):
-        table.add_column(Text(name), justify="left" if index == 0 else "right", no_wrap=True)
+    for index, (name, *cells) in enumerate(itertools.zip_longest(head, *rows, fillvalue="")):
+        # A narrow terminal folds cells between words; no column disappears.
+        longest = max(map(len, " ".join((name, *cells)).split()), default=0)
+        table.add_column(Text(name), justify="left" if index == 0 else "right", min_width=longest)
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     console = Console(width=None if sys.stdout.isatty() else _NO_EDGE)
     # A line of its own: as the table's title a path would be folded to the table's width.
     console.print(Text(title, style="table.title"), soft_wrap=True)
-    console.print(table)
+    console.print(table, crop=False)
 
 
 def note(message: str) -> None:
