@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
@@ -39,17 +40,22 @@ def settle(guess: signals.Guess, log: Path, proposal: Path) -> signals.Guess:
             kind = click.Choice([doubt.taken, *doubt.choices])
             said = click.prompt(doubt.about, default=doubt.taken, type=kind, err=True)
             guess = guess.settle_doubt(doubt, None if said == doubt.taken else said)
-        elif click.confirm(f"{doubt}. Is that right?", default=True, err=True):
-            guess = guess.settle_doubt(doubt)
         else:
-            raise DataError(
-                f"{log}: {doubt.about}: {doubt.taken} was said to be wrong. Write the right columns into a layout "
-                f"(`softneck import {log} --guess --yes` proposes {proposal}) and use --layout."
-            )
+            _confirm(
+                doubt, log, f"Write the right columns into a layout (`softneck import {log} --guess --yes` "
+                f"proposes {proposal}) and use --layout.",
+            )  # fmt: skip
+            guess = guess.settle_doubt(doubt)
     if any(line.startswith("the sample time") for line in guess.missing):
         kind = click.FloatRange(min=0.0, max=1e4, min_open=True)
         guess = guess.with_sample_time(click.prompt("No column is a time. Sample time [s]", type=kind, err=True))
     return guess
+
+
+def _confirm(doubt: signals.Doubt, log: Path, advice: str) -> None:
+    """Ask whether a guess is right; raise DataError with the advice if it is not."""
+    if not click.confirm(f"{doubt}. Is that right?", default=True, err=True):
+        raise DataError(f"{log}: {doubt.about}: {doubt.taken} was said to be wrong. {advice}")
 
 
 @dataclass(slots=True)
@@ -83,6 +89,11 @@ class _Job:
     robot: str | None = None
     named: signals.NamedColumns | None = None
     texts: dict[Path, tuple[str, bool]] = field(default_factory=dict)
+
+    @property
+    def asks(self) -> bool:
+        """Whether the user is asked about what is not sure."""
+        return not self.yes and not self.as_json and is_terminal()
 
     def beside(self, ending: str) -> Path:
         """Return the path of a file beside the recording; raise OutputFileError if it exists and must be kept."""
@@ -311,7 +322,7 @@ def _by_guess(
         guess = guess.with_sample_time(job.clock)
     for line in guess.lines:
         note(line)
-    if not job.yes and not job.as_json and is_terminal():
+    if job.asks:
         guess = settle(guess, job.log, proposal)
     job.texts[proposal] = (guess.text, job.replace)
     if guess.missing:
@@ -364,6 +375,11 @@ def _of_robot(
             found = signals.layout_for(job.log, robot, sample_time=job.clock)
     for line in found.lines:
         note(line)
+    if job.asks:
+        for doubt in found.doubts:
+            line = signals.columns_line(job.log)
+            _confirm(doubt, job.log, f"Name the right columns, with units in their titles: {line}")
+        found = dataclasses.replace(found, doubts=())
     facts |= {"reasons": list(found.lines), "doubts": [doubt.as_dict() for doubt in found.doubts]}
     layout, remarks = found.layout, {}
     for doubt in found.doubts:

@@ -115,6 +115,25 @@ def test_columns_that_are_said_to_be_wrong_import_nothing(
     assert files(tmp_path) == {"log.csv"}
 
 
+@pytest.mark.parametrize("right", [True, False])
+def test_in_a_terminal_what_is_not_sure_of_another_robot_is_asked(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, right: bool
+) -> None:
+    time = 0.02 * np.arange(400.0)
+    pd.DataFrame({"time [s]": time, "p_cmd [%]": np.sin(time), "tip [mm]": np.cos(time)}).to_csv("log.csv", index=False)
+    monkeypatch.setattr("softneck.cli._import.is_terminal", lambda: True)
+    asked: list[str] = []
+    monkeypatch.setattr(_import.click, "confirm", lambda text, **_: asked.append(text) or right)
+    said = call("import", "log.csv", "--guess", "-o", "r.csv")
+    assert asked[0] == "robot: p_cmd [%] move, tip [mm] are outputs (80 % sure): by titles. Is that right?"
+    if right:
+        assert (said.code, len(asked)) == (0, 2)  # the unit `%` too
+        assert "NOT SURE" not in (tmp_path / "r.layout.toml").read_text()
+    else:
+        assert (said.code, files(tmp_path)) == (2, {"log.csv"})
+        assert "was said to be wrong. Name the right columns, with units in their titles: `softneck" in said.err
+
+
 def test_a_preview_shows_doubts_first_and_what_was_made(call: Call, tmp_path: Path) -> None:
     log(tmp_path, motors=3.0, platform=20.0)
     frame = pd.read_csv("log.csv")
