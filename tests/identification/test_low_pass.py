@@ -60,3 +60,32 @@ def test_many_runs_need_no_more_memory_than_their_rows() -> None:
     tracemalloc.stop()
     # Three copies of inputs and output; a regressor for the start of each run would be 30 more columns.
     assert peak < 3 * 8 * 3 * RUN * RUNS + 100_000
+
+
+def held(rng: np.random.Generator, low: float, high: float) -> Vector:
+    """Levels of 25 samples."""
+    return np.repeat(rng.uniform(low, high, 120), 25)
+
+
+def lagged(u: Vector) -> Vector:
+    pole = np.exp(-1.0 / TAU)
+    delayed = np.concatenate([np.full(LATE + 1, u[0]), u[: -LATE - 1]])
+    return np.asarray(dsp.lfilter([1.0 - pole], [1.0, -pole], delayed))
+
+
+def test_rounding_of_tendons_in_pairs_of_one_sum_is_no_motion() -> None:
+    """What `T1 + T3 = T2 + T4` leaves of four tendons is rounding, which had become the whole direction."""
+    rng = np.random.default_rng(3)
+    u, v, c = held(rng, -12.0, 12.0), held(rng, -12.0, 12.0), held(rng, 0.0, 2.0)
+    U = np.round(np.column_stack([c + u, c + v, c - u, c - v]), 2)
+    y = np.sin(lagged(u) / 10.0) + 0.003 * rng.standard_normal(u.size)
+    _, weights, _ = _fit_low_pass([U], [y])
+    # The sine is no line: of the other pair's and the pretension's weights a tenth is left over.
+    np.testing.assert_allclose(weights / np.linalg.norm(weights), np.array([1.0, 0.0, -1.0, 0.0]) / 2**0.5, atol=0.1)
+
+
+def test_a_small_motion_that_the_output_follows_is_no_rounding() -> None:
+    rng = np.random.default_rng(4)
+    d, c = held(rng, -0.05, 0.05), held(rng, -6.0, 6.0)
+    _, weights, _ = _fit_low_pass([np.column_stack([c + d, c - d])], [lagged(d) + 1e-3 * rng.standard_normal(d.size)])
+    np.testing.assert_allclose(weights, [0.5, -0.5], rtol=0.05)  # noise of a thirtieth of the motion

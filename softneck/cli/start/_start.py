@@ -148,8 +148,8 @@ def _robot_of(log: Path, robot: str | None) -> str | None:
 def _read_options(logs: tuple[str, ...], given: dict[str, Any], *, yes: bool, guided: bool) -> Options:
     """Return the options; in a terminal the user is asked for missing ones."""
     if guided and given.get("robot") is None:
-        said = click.prompt("Whose log is it: neck, arm, antagonist, finger, trunk4, a robot file (Enter: as its columns "
-                            "tell)", default="", show_default=False, err=True)  # fmt: skip
+        said = click.prompt("Whose log is it: neck, arm, antagonist, finger, trunk4 or a robot file (Enter: as its "
+                            "columns tell)", default="", show_default=False, err=True)  # fmt: skip
         given["robot"] = None if said in ("", "neck") else _robot_of(Path(logs[0]), said)
     if guided and given.get("requirements") is None:
         said = click.prompt("Requirements file for the controller (Enter: the defaults)", default="",

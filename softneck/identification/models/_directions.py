@@ -28,6 +28,9 @@ _TIME_CONSTANT_COUNT = 40
 _MAX_DEAD_TIME, _MAX_DEAD_TIME_STEPS = 1.5, 20
 # Relative singular value below which motions count as dependent; least squares then takes the smallest weights.
 _RANK_TOLERANCE = 1e-6
+# Below this it is taken for rounding of set-points, as of four tendons whose pairs always add up to one pretension,
+# unless the error of the fit without it is this many times as large.
+_ROUNDING, _WORTH = 0.02, 1.25
 # After so many time constants what was at the start is below rounding.
 _DECAYED = 37.0
 
@@ -141,10 +144,10 @@ def _fit_low_pass(inputs: Sequence[Matrix], outputs: Sequence[Vector]) -> tuple[
     mean = y[np.isfinite(y)].sum() / y.size  # nearly so; without it less is lost to rounding
     runs = [((U / scale).T.copy(), run - mean) for U, run in zip(inputs, outputs, strict=True)]
 
-    def fit(tau: float, late: int) -> tuple[float, Vector]:
+    def fit(tau: float, late: int, tolerance: float = _RANK_TOLERANCE) -> tuple[float, Vector]:
         # Normal equations: the rows of a long recording are read once for each filter, and none is copied.
         products: Any = sum(_low_pass_products(U, run, tau, late) for U, run in runs)
-        theta = np.linalg.lstsq(products[:-1, :-1], products[:-1, -1], rcond=_RANK_TOLERANCE**2)[0]
+        theta = np.linalg.lstsq(products[:-1, :-1], products[:-1, -1], rcond=tolerance**2)[0]
         return float(products[-1, -1] - products[:-1, -1] @ theta), theta[:-1] / scale
 
     ladder = np.geomspace(0.5, longest / 3.0, _TIME_CONSTANT_COUNT)
@@ -159,7 +162,8 @@ def _fit_low_pass(inputs: Sequence[Matrix], outputs: Sequence[Vector]) -> tuple[
         )
         best = min(best, (float(found.fun), float(np.exp(found.x)), late))
         late += step
-    return best[1], fit(best[1], best[2])[1], best[2]
+    (least, weights), (error, fewer) = (fit(best[1], best[2], rank) for rank in (_RANK_TOLERANCE, _ROUNDING))
+    return best[1], weights if error > _WORTH * least else fewer, best[2]
 
 
 def _low_pass_products(U: Matrix, y: Vector, tau: float, late: int) -> Matrix:
