@@ -8,7 +8,7 @@ import numpy as np
 import scipy.signal as dsp
 
 from softneck.core import Matrix, Vector
-from softneck.identification.models._directions import _fit_low_pass
+from softneck.identification.models._directions import Directions, _fit_low_pass
 
 RUN, RUNS, TAU, LATE = 200, 30, 12.0, 3
 
@@ -73,11 +73,27 @@ def lagged(u: Vector) -> Vector:
     return np.asarray(dsp.lfilter([1.0 - pole], [1.0, -pole], delayed))
 
 
-def test_rounding_of_tendons_in_pairs_of_one_sum_is_no_motion() -> None:
-    """What `T1 + T3 = T2 + T4` leaves of four tendons is rounding, which had become the whole direction."""
+def pairs() -> tuple[Vector, Matrix]:
+    """The motion of the first of two pairs of tendons, and set-points (time, 4) of two decimals."""
     rng = np.random.default_rng(3)
     u, v, c = held(rng, -12.0, 12.0), held(rng, -12.0, 12.0), held(rng, 0.0, 2.0)
-    U = np.round(np.column_stack([c + u, c + v, c - u, c - v]), 2)
+    return u, np.round(np.column_stack([c + u, c + v, c - u, c - v]), 2)
+
+
+def test_inputs_of_a_nonlinear_model_are_motions_and_no_rounding() -> None:
+    U = pairs()[1]
+    found = Directions(("x",), np.array([[0.5, 0.0, -0.5, 0.0]]), np.ones(1), learned=True)
+    T = found.all_inputs(U)
+    assert T.shape == (3, 4)
+    # What pairs of one sum never do is in no input.
+    np.testing.assert_allclose(T @ [1.0, -1.0, 1.0, -1.0], 0.0, atol=1e-3)
+    assert found.all_inputs(U + np.random.default_rng(6).uniform(-3.0, 3.0, U.shape)).shape == (4, 4)
+
+
+def test_rounding_of_tendons_in_pairs_of_one_sum_is_no_motion() -> None:
+    """What `T1 + T3 = T2 + T4` leaves of four tendons is rounding, which had become the whole direction."""
+    u, U = pairs()
+    rng = np.random.default_rng(5)
     y = np.sin(lagged(u) / 10.0) + 0.003 * rng.standard_normal(u.size)
     _, weights, _ = _fit_low_pass([U], [y])
     # The sine is no line: of the other pair's and the pretension's weights a tenth is left over.

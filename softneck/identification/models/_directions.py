@@ -61,15 +61,20 @@ class Directions:
         return _geometric_mean(self.seconds)
 
     def all_inputs(self, set_points: Matrix) -> Matrix:
-        """Complete `redefinition` to T (motors, motors) by the other principal motions of set-points (time, motors)."""
+        """Complete `redefinition` to T (inputs, motors) by the other principal motions of set-points (time, motors).
+
+        Those that are rounding at most are left out: nothing is known of them.
+        """
         if self.given is not None and len(self.given) == len(self.given.T) and self.given[-1].any():
             return self.given
         rows = _independent(self.weights)
         _, _, basis = np.linalg.svd(rows)
         across = basis[len(rows) :]
         # Principal axes of the motion that moves no output: nothing else distinguishes one basis from another.
-        _, axes = np.linalg.eigh(across @ np.atleast_2d(np.cov(set_points.T)) @ across.T)
-        return np.vstack([rows, axes.T[::-1] @ across])
+        moved = np.atleast_2d(np.cov(set_points.T))
+        sizes, axes = np.linalg.eigh(across @ moved @ across.T)
+        known = sizes > _ROUNDING**2 * np.linalg.eigvalsh(moved)[-1]
+        return np.vstack([rows, axes.T[known][::-1] @ across])
 
     def findings(self) -> dict[str, object]:
         """Return the directions as findings of a model."""
