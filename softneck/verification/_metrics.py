@@ -47,7 +47,8 @@ class Scale:
     def of(cls, robot: Robot, sources: Sequence[PlantSource] = ()) -> Scale:
         """Return the scale from the robot file, else from its ranges and plants."""
         slowest = [1.0 / float(box.nominal[1]) for source in sources for box in source.axes]
-        scaling = Scaling.of(robot, time_constant=max([*slowest, *(s.sample_time for s in sources)], default=None))
+        slowest += [each for source in sources for each in (source.sample_time, source.decay)]
+        scaling = Scaling.of(robot, time_constant=max(slowest, default=None))
         motors, outputs = robot.motors, robot.outputs
         load, output = scaling.motor_unit, float(scaling.output_unit.min())
         if sources and (motors.nominal is None or outputs.nominal is None):

@@ -118,6 +118,7 @@ class PlantSource:
     `name`: of its file. `sample_time`: [s]. `axes`: one for each output. `cross`: (m (m - 1),) gains of the other axes'
     inputs over the axis's own, axis by axis: for the neck phi_i into pitch, theta_i into roll. `kind`: "family" or
     "model". `robot`: of the plant. `weights`: (m, motors) of the motors in each axis's input; for the neck Eq. 9, 10.
+    `decay`: time constant in which its slowest oscillation decays [s]; 0 without one.
     """
 
     name: str
@@ -127,6 +128,7 @@ class PlantSource:
     kind: str
     weights: Matrix
     robot: Robot = field(default_factory=Robot.preset)
+    decay: float = 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -214,7 +216,16 @@ def source_of_family(family: Any, name: str) -> PlantSource:
     return PlantSource(
         name=name, sample_time=family.sample_time, axes=tuple(boxes), kind="family", robot=robot,
         cross=_known_cross(family.cross[:, : len(names)] / own[:, None], name, robot), weights=directions_of(family),
+        decay=0.0 if getattr(family, "draws", None) is None else _decay_of(family.draws.model),
     )  # fmt: skip
+
+
+def _decay_of(model: Any) -> float:
+    """Return the time constant [s] in which the slowest oscillation of an identified linear model decays; 0 without."""
+    found = getattr(model, "findings", {}).get("transfer_functions", {})
+    poles = np.concatenate([np.zeros(0), *(np.roots([1.0, *one["a"]]) for one in found.values())])
+    sizes = np.abs(poles[np.imag(poles) != 0.0])
+    return float(-model.sample_time / np.log(sizes.max())) if sizes.size else 0.0
 
 
 def _known_cross(gains: Matrix, name: str, robot: Robot) -> Vector:
@@ -258,6 +269,7 @@ def source_of_model(model: Any, name: str, spread: Mapping[str, float]) -> Plant
     return PlantSource(
         name=name, sample_time=plants[0].sample_time, axes=tuple(_axis_of(plant, spread) for plant in plants),
         cross=_cross_gains(model, plants, name), kind="model", robot=robot, weights=directions_of(model),
+        decay=_decay_of(model),
     )  # fmt: skip
 
 

@@ -466,10 +466,10 @@ CART = Robot.from_dict({
 })  # fmt: skip
 
 
-def source_with(*axes: tuple[float, float], Ts: float = 0.01) -> Any:
+def source_with(*axes: tuple[float, float], Ts: float = 0.01, decay: float = 0.0) -> Any:
     """Return a source whose axes have these static gains [m/V] and poles [1/s]."""
     boxes = [SimpleNamespace(nominal=np.array([gain, pole, 0.0])) for gain, pole in axes]
-    return SimpleNamespace(axes=boxes, sample_time=Ts, weights=np.array([[1.0, 0.5], [0.0, 1.0]]))
+    return SimpleNamespace(axes=boxes, sample_time=Ts, weights=np.array([[1.0, 0.5], [0.0, 1.0]]), decay=decay)
 
 
 def test_a_scale_is_that_of_the_slowest_and_least_of_all_plants() -> None:
@@ -491,6 +491,9 @@ def test_a_scale_is_that_of_the_slowest_and_least_of_all_plants() -> None:
     assert Scale.of(CART, [one]).time == found.time
     assert Scale.of(CART, [two]).time == pytest.approx(found.time * 4.0 / 8.0)
     assert Scale.of(CART, [source_with((0.02, 5.0), (0.03, 4.0), Ts=0.5)]).time == pytest.approx(2.0 * found.time)
+    # Or by what decays later than the slowest pole of one.
+    assert Scale.of(CART, [source_with((0.02, 5.0), (0.03, 4.0), decay=0.5)]).time == pytest.approx(2.0 * found.time)
+    assert Scale.of(CART, [source_with((0.02, 5.0), (0.03, 4.0), decay=0.2)]).time == found.time
     # Inputs by the least that the motors add up to: half the ranges of 2 and 4 V, weighted: 4 and 4; outputs by the
     # least of gain times that.
     size = Scale.of(CART, [source_with((0.02, 5.0), (0.01, 4.0))]).size

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import product
@@ -26,6 +27,7 @@ from softneck.core import (
 )
 from softneck.signals import Recording, concatenate, conditions, merge_conditions
 
+from ..linear._oe_draws import OutputErrorDraws
 from ..models._arrays import check_arrays
 from ..models._fitting import ScaledData, sensor_noise
 from ..models._model import WARM_UP, Model, embed_model, embedded_model
@@ -64,7 +66,7 @@ _CLASSES = (("small", 0.0, 0.25), ("middle", 0.25, 0.6), ("large", 0.6, math.inf
 
 
 class Source(Protocol):
-    """What draws come from: `GreyBoxDraws` or `PlayDraws`."""
+    """What draws come from: `GreyBoxDraws`, `PlayDraws` or `OutputErrorDraws`."""
 
     @property
     def model(self) -> Model: ...
@@ -209,13 +211,13 @@ def make_draws(
     """Return draws of a robot from its recordings.
 
     Models are fitted to the first three quarters of each run: for robots that tendons bend the grey box without and
-    with its optional parts, else kind `play`. What the nearest draw leaves over of the last quarters, less the sensor's
-    noise, is a disturbance. The model is the one that, with disturbance and noise, predicts them best, by the
-    continuous ranked probability score (Gneiting and Raftery 2007, J. Am. Stat. Assoc. 102:359); of `play` the ridge is
-    the largest and of each the factor on the deviations of its numbers the smallest within one standard error of the
-    best (Breiman et al. 1984, sec. 3.4): plays that hardly a motion tells apart would swing.
-    Then the disturbance is raised until the band covers `LEVEL` of the samples at every amplitude. Simulations begin
-    20 s of a neck's time before the last quarters.
+    with its optional parts, else kind `play` and, if it is of second order, `oe`. What the nearest draw leaves over
+    of the last quarters, less the sensor's noise, is a disturbance. The model is the one that, with disturbance and
+    noise, predicts them best, by the continuous ranked probability score (Gneiting and Raftery 2007, J. Am. Stat.
+    Assoc. 102:359); of `play` the ridge is the largest and of each the factor on the deviations of its numbers the
+    smallest within one standard error of the best (Breiman et al. 1984, sec. 3.4): plays that hardly a motion tells
+    apart would swing. Then the disturbance is raised until the band covers `LEVEL` of the samples at every amplitude.
+    Simulations begin 20 s of a neck's time before the last quarters.
 
     Args:
         recordings: of one robot and sample time, the payload as a channel.
@@ -280,11 +282,14 @@ def _motion(recording: Recording) -> list[float]:
 
 
 def _sources(train: Recording, progress: Progress) -> list[Source]:
-    """Return what draws may come from: grey boxes without and with optional parts; of other robots kind `play`."""
+    """Return what draws may come from: grey boxes without and with optional parts; of other robots `play` and `oe`."""
     try:
         return [GreyBoxDraws.fit(train, body=body, progress=progress) for body in ("rigid", "all")]
     except SettingsError:  # a robot that no tendons on winches bend
-        return [PlayDraws.fit(train, progress=progress)]
+        found: list[Source] = [PlayDraws.fit(train, progress=progress)]
+    with suppress(DataError):  # one pole does for it
+        found.append(OutputErrorDraws.fit(train))
+    return found
 
 
 def _split(recording: Recording, second: float) -> tuple[Recording, Recording, list[int]]:

@@ -219,8 +219,9 @@ def test_what_a_recording_moves_is_the_largest_from_its_middle() -> None:
     assert _draws._motion(recording) == pytest.approx([0.4, 2.0])
 
 
-def test_draws_come_from_grey_boxes_with_and_without_parts_or_else_from_play(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_draws_come_from_grey_boxes_or_else_from_play_and_two_poles(monkeypatch: pytest.MonkeyPatch) -> None:
     nothing: Any = SimpleNamespace()
+    monkeypatch.setattr(_draws.OutputErrorDraws, "fit", lambda *_: "oe")
     monkeypatch.setattr(_draws.GreyBoxDraws, "fit", lambda *_, body, **__: body)
     monkeypatch.setattr(_draws.PlayDraws, "fit", lambda *_, **__: "play")
     assert _draws._sources(nothing, lambda *_: None) == ["rigid", "all"]
@@ -229,6 +230,12 @@ def test_draws_come_from_grey_boxes_with_and_without_parts_or_else_from_play(mon
         raise SettingsError("no winches")
 
     monkeypatch.setattr(_draws.GreyBoxDraws, "fit", refuse)
+    assert _draws._sources(nothing, lambda *_: None) == ["play", "oe"]
+
+    def first_order(*_: Any) -> Any:
+        raise DataError("one pole")
+
+    monkeypatch.setattr(_draws.OutputErrorDraws, "fit", first_order)
     assert _draws._sources(nothing, lambda *_: None) == ["play"]
 
 
