@@ -1937,7 +1937,7 @@ class _Found:
 
 def test_four_draws_of_each_family_are_in_every_loop_of_a_search() -> None:
     models = [linear_neck() for _ in range(9)]
-    draws: Any = SimpleNamespace(for_search=lambda count: models[:count], conditions={"payload_kg": [0.0]})
+    draws: Any = SimpleNamespace(model=None, for_search=lambda count: models[:count], conditions={"payload_kg": [0.0]})
     task = task_of({"f": replace(family(), draws=draws), "g": family()}, {}, 0)
     assert task.own == {f"f, draw {k + 1}": models[k] for k in range(4)}
     assert task.drawn == tuple(task.own)
