@@ -51,9 +51,10 @@ _MAX_ITERATIONS = 50
 _COST_TOLERANCE = 1e-10
 # Starts of the search beside least squares [scaled s]: a neck's time constant and values around it.
 _START_TIME_CONSTANTS_S = (0.05, 0.2, 0.8)
-# Two poles are taken where they leave a third of the error of one, unless that fits so well [%]. On robots of second
-# order they leave 0.01 to 0.07, on those of first order 0.37 and more.
-_LEFT_OVER, _GOOD_FIT = 3.0, 99.0
+# Two poles are taken where they leave at most so much of the error of one, and more where they oscillate, unless one
+# fits so well [%]. On linear robots of second order they leave 0.01 to 0.07, on oscillating ones with hysteresis 0.37
+# to 0.53; on others they leave 0.75 and more where they oscillate, else 0.46 and more.
+_LEFT_OVER, _LEFT_OVER_OSCILLATING, _GOOD_FIT = 1.0 / 3.0, 2.0 / 3.0, 99.0
 # -log of the rounding of a double.
 _LOG_PRECISION = 36.0
 
@@ -307,7 +308,7 @@ class OutputError:
     Attributes:
         nf, nb: poles, and coefficients of the numerator. None: one pole, or two where the motors excite a lightly
             damped mode of an output (`assess_quality` finds it on held-out rows), or, with no dead time given, where
-            two leave at most a third of the error; as many coefficients as poles.
+            two leave at most a third of the error, two thirds if they oscillate; as many coefficients as poles.
         delay: dead time [s]; None takes the one of the smallest cost.
         max_delay: end of that search [s]; None: one and a half time constants of the robot (of a neck 0.3 s).
         source: input of the model: "set_points", or "positions" of the motors, which the drive model simulates from
@@ -356,7 +357,7 @@ class OutputError:
         return replace(self, nf=2, nb=2)._fit(recording, modes, progress)
 
     def _needs_two_poles(self, model: Model, recording: Recording) -> bool:
-        """Return whether two poles leave at most a third of what the model of one pole leaves over of an output.
+        """Return whether two poles leave much less of an output over than the model of one pole.
 
         One pole makes a dead time of the second: two are tried with less of it too.
         """
@@ -371,7 +372,10 @@ class OutputError:
                 Phi, Y = arx_rows(columns, 2, 2, dead)
                 start = np.linalg.lstsq(Phi, Y[:, 0])[0][:2]
                 found = fit_output_error(runs, 2, 2, dead, [start], constant=scaled.has_offset)
-                if found is not None and _LEFT_OVER * (100.0 - _percent(found.cost, spread)) <= 100.0 - fit:
+                if found is None:
+                    continue
+                most = _LEFT_OVER_OSCILLATING if np.iscomplex(_poles(found.f)).any() else _LEFT_OVER
+                if 100.0 - _percent(found.cost, spread) <= most * (100.0 - fit):
                     return True
         return False
 

@@ -211,7 +211,7 @@ def make_draws(
     """Return draws of a robot from its recordings.
 
     Models are fitted to the first three quarters of each run: for robots that tendons bend the grey box without and
-    with its optional parts, else kind `play` and, if it is of second order, `oe`. What the nearest draw leaves over
+    with its optional parts, else kind `play` or, of a robot of second order, `oe`. What the nearest draw leaves over
     of the last quarters, less the sensor's noise, is a disturbance. The model is the one that, with disturbance and
     noise, predicts them best, by the continuous ranked probability score (Gneiting and Raftery 2007, J. Am. Stat.
     Assoc. 102:359); of `play` the ridge is the largest and of each the factor on the deviations of its numbers the
@@ -282,14 +282,16 @@ def _motion(recording: Recording) -> list[float]:
 
 
 def _sources(train: Recording, progress: Progress) -> list[Source]:
-    """Return what draws may come from: grey boxes without and with optional parts; of other robots `play` and `oe`."""
+    """Return what draws may come from: grey boxes without and with optional parts; of other robots `play`.
+
+    Where two poles are better than one, they come from `oe`: no draw of `play` would overshoot as such a robot does.
+    """
     try:
         return [GreyBoxDraws.fit(train, body=body, progress=progress) for body in ("rigid", "all")]
     except SettingsError:  # a robot that no tendons on winches bend
-        found: list[Source] = [PlayDraws.fit(train, progress=progress)]
-    with suppress(DataError):  # one pole does for it
-        found.append(OutputErrorDraws.fit(train))
-    return found
+        with suppress(DataError):  # one pole does for it
+            return [OutputErrorDraws.fit(train, progress=progress)]
+        return [PlayDraws.fit(train, progress=progress)]
 
 
 def _split(recording: Recording, second: float) -> tuple[Recording, Recording, list[int]]:

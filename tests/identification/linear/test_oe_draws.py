@@ -44,6 +44,21 @@ def test_a_robot_of_second_order_has_two_poles_by_default(damping: float) -> Non
     np.testing.assert_allclose(poles(dict(model.arrays)), np.sort_complex(root), rtol=0, atol=5e-3)
 
 
+def test_two_poles_that_oscillate_need_to_leave_less_than_two_that_do_not() -> None:
+    """Noise of this size leaves both with half of the error that one pole leaves."""
+    settings = {}
+    for damping, noise in ((0.4, 0.15), (1.5, 0.015)):
+        recording = oscillating(damping, noise=noise)
+        left = []
+        for nf in (1, 2):
+            curve = OutputError(nf=nf, nb=nf).fit(recording).findings["delay_curve"]["tip"]
+            left.append(100.0 - max(fit for _, fit, _ in curve))
+        one, two = left
+        assert 0.4 < two / one < 0.65, damping
+        settings[damping] = OutputError().fit(recording).settings["nf"]
+    assert settings == {0.4: 2, 1.5: 1}
+
+
 def test_a_robot_of_first_order_keeps_one_pole_whatever_its_noise() -> None:
     recording = oscillating(0.5)
     u = recording.set_points[:, 0]

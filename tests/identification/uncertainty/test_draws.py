@@ -221,7 +221,7 @@ def test_what_a_recording_moves_is_the_largest_from_its_middle() -> None:
 
 def test_draws_come_from_grey_boxes_or_else_from_play_and_two_poles(monkeypatch: pytest.MonkeyPatch) -> None:
     nothing: Any = SimpleNamespace()
-    monkeypatch.setattr(_draws.OutputErrorDraws, "fit", lambda *_: "oe")
+    monkeypatch.setattr(_draws.OutputErrorDraws, "fit", lambda *_, **__: "oe")
     monkeypatch.setattr(_draws.GreyBoxDraws, "fit", lambda *_, body, **__: body)
     monkeypatch.setattr(_draws.PlayDraws, "fit", lambda *_, **__: "play")
     assert _draws._sources(nothing, lambda *_: None) == ["rigid", "all"]
@@ -230,9 +230,9 @@ def test_draws_come_from_grey_boxes_or_else_from_play_and_two_poles(monkeypatch:
         raise SettingsError("no winches")
 
     monkeypatch.setattr(_draws.GreyBoxDraws, "fit", refuse)
-    assert _draws._sources(nothing, lambda *_: None) == ["play", "oe"]
+    assert _draws._sources(nothing, lambda *_: None) == ["oe"]
 
-    def first_order(*_: Any) -> Any:
+    def first_order(*_: Any, **__: Any) -> Any:
         raise DataError("one pole")
 
     monkeypatch.setattr(_draws.OutputErrorDraws, "fit", first_order)
