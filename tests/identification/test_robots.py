@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
+from scipy.signal import lfilter
 
 from softneck import identify, load, validate
 from softneck.core import DataError, FileFormatError, Matrix, SettingsError
@@ -101,6 +102,23 @@ def test_rls_over_the_motors_takes_any_robot() -> None:
     for structure in ("miso", "mimo"):
         model = identify("rls", recording, train=1.0, structure=structure, delay=0.06)
         np.testing.assert_allclose(model.ss().dcgain(), GAIN * WEIGHTS, atol=2e-3)
+
+
+@pytest.mark.parametrize("structure", ["miso", "mimo"])
+def test_rls_over_motors_in_pairs_learns_nothing_of_what_they_never_did(structure: str) -> None:
+    """Rounding of `a + c = b + d` had gains far larger than those of the motions."""
+    seen = recorded(ROBOTS["bellows"], rows=2000)
+    a, b, c, _ = (np.round(seen.channels[name], 3) for name in seen.robot.set_points)
+    rounding = np.round(np.random.default_rng(8).uniform(-1e-3, 1e-3, a.size), 3)
+    U = np.column_stack([a, b, c, a + c - b + rounding])
+    x = lfilter([1.0 - POLE], [1.0, -POLE], GAIN * U @ WEIGHTS.T, axis=0)
+    Y = np.concatenate([np.zeros((DELAY + 1, 3)), x[: -DELAY - 1]])
+    Y += 1e-3 * np.random.default_rng(9).standard_normal(Y.shape)
+    channels = dict(zip(seen.robot.set_points, U.T, strict=True)) | dict(zip("xyz", Y.T, strict=True))
+    model = identify("rls", seen.with_channels(**channels), train=1.0, delay=0.06, structure=structure)
+    never = np.array([1.0, -1.0, 1.0, -1.0]) / 2.0
+    made = WEIGHTS - np.outer(WEIGHTS @ never, never)
+    np.testing.assert_allclose(model.ss().dcgain(), GAIN * made, atol=0.1 * GAIN)  # noise of a hundredth of the motion
 
 
 @pytest.mark.parametrize("name", ["finger", "bellows"])

@@ -300,7 +300,15 @@ class Rls:
         recording = scaled.data
         drive = fit_drive(recording).array
         Ts = recording.sample_time
-        runs = [(run.outputs, run.set_points) for run in recording.runs()]
+        # Of motors that never moved by themselves, such as tendons in pairs, only the motions that were made are known.
+        motors, T = recording.set_points.shape[1], scaled.directions.all_inputs(recording.set_points)
+        T = T if len(T) < motors else np.eye(motors)
+        runs = [(run.outputs, run.set_points @ T.T) for run in recording.runs()]
+
+        def over_motors(theta: Vector) -> Vector:
+            own, inputs = np.split(theta, [theta.size - len(T) * self.nb])
+            return np.concatenate([own, (T.T @ inputs.reshape(len(T), self.nb)).ravel()])
+
         names = recording.robot.outputs.names
         if self.structure == "miso":
             found = []
@@ -308,7 +316,7 @@ class Rls:
                 progress(axis / len(names), name)
                 found.append(self._search(Ts, [(Y[:, [axis]], U) for Y, U in runs], name))
             delays = [d for d, *_ in found]
-            arrays = motor_arrays(self, [theta for _, theta, *_ in found], delays, drive)
+            arrays = motor_arrays(self, [over_motors(theta) for _, theta, *_ in found], delays, drive)
             curves = {name: curve for name, (*_, curve, _) in zip(names, found, strict=True)}
             return arrays, {"delay_curve": curves, "condition_number": [number for *_, number in found]}
         best, curves = None, {name: [] for name in names}
@@ -321,7 +329,7 @@ class Rls:
                 self._least_squares([(Y[:, order], U) for Y, U in runs], d, name)
                 for order, name in zip(orders, names, strict=True)
             ]
-            arrays = motor_arrays(self, [theta for theta, *_ in both], [d] * len(names), drive)
+            arrays = motor_arrays(self, [over_motors(theta) for theta, *_ in both], [d] * len(names), drive)
             fits = _simulation_fits(Model(kind="rls", sample_time=Ts, arrays=arrays, robot=recording.robot), recording)
             for name, fit, (_, _, rms, _) in zip(names, fits, both, strict=True):
                 curves[name].append([d * Ts, fit, rms])

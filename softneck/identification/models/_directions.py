@@ -31,6 +31,8 @@ _RANK_TOLERANCE = 1e-6
 # Below this it is taken for rounding of set-points, as of four tendons whose pairs always add up to one pretension,
 # unless the error of the fit without it is this many times as large.
 _ROUNDING, _WORTH = 0.02, 1.25
+# Singular value below which directions of length 1 count as nearly a combination of others.
+_PARALLEL = 0.1
 # After so many time constants what was at the start is below rounding.
 _DECAYED = 37.0
 
@@ -68,13 +70,12 @@ class Directions:
         if self.given is not None and len(self.given) == len(self.given.T) and self.given[-1].any():
             return self.given
         rows = _independent(self.weights)
-        _, _, basis = np.linalg.svd(rows)
-        across = basis[len(rows) :]
+        taken = np.vstack([rows, _never_moved(set_points).T])
+        _, sizes, basis = np.linalg.svd(taken)
+        across = basis[int((sizes > _PARALLEL).sum()) :]
         # Principal axes of the motion that moves no output: nothing else distinguishes one basis from another.
-        moved = np.atleast_2d(np.cov(set_points.T))
-        sizes, axes = np.linalg.eigh(across @ moved @ across.T)
-        known = sizes > _ROUNDING**2 * np.linalg.eigvalsh(moved)[-1]
-        return np.vstack([rows, axes.T[known][::-1] @ across])
+        _, axes = np.linalg.eigh(across @ np.atleast_2d(np.cov(set_points.T)) @ across.T)
+        return np.vstack([rows, axes.T[::-1] @ across])
 
     def findings(self) -> dict[str, object]:
         """Return the directions as findings of a model."""
@@ -168,7 +169,18 @@ def _fit_low_pass(inputs: Sequence[Matrix], outputs: Sequence[Vector]) -> tuple[
         best = min(best, (float(found.fun), float(np.exp(found.x)), late))
         late += step
     (least, weights), (error, fewer) = (fit(best[1], best[2], rank) for rank in (_RANK_TOLERANCE, _ROUNDING))
-    return best[1], weights if error > _WORTH * least else fewer, best[2]
+    never = _never_moved(np.concatenate(inputs))
+    return best[1], weights if error > _WORTH * least else fewer - never @ (never.T @ fewer), best[2]
+
+
+def _never_moved(set_points: Matrix) -> Matrix:
+    """Return an orthonormal basis (motors, n) of motions that set-points (time, motors) hold as rounding at most."""
+    centred = set_points - set_points.mean(axis=0)
+    moved = centred.T @ centred
+    scale = np.sqrt(np.diag(moved))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    sizes, axes = np.linalg.eigh(moved / np.outer(scale, scale))
+    return np.linalg.qr(axes[:, sizes < _ROUNDING**2 * sizes[-1]] / scale[:, None])[0]
 
 
 def _low_pass_products(U: Matrix, y: Vector, tau: float, late: int) -> Matrix:
@@ -195,7 +207,7 @@ def _independent(weights: Matrix) -> Matrix:
     """Return the rows that are not nearly a combination of the rows before them."""
     kept: list[Vector] = []
     for row in weights / np.linalg.norm(weights, axis=1, keepdims=True):
-        if np.linalg.matrix_rank(np.array([*kept, row]), tol=0.1) > len(kept):
+        if np.linalg.matrix_rank(np.array([*kept, row]), tol=_PARALLEL) > len(kept):
             kept.append(row)
     return np.array(kept)
 
