@@ -5,7 +5,7 @@ Rates and dead times are in the time of a neck. Several payloads tell how stiffn
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,8 +30,8 @@ from ..models._linear_systems import history_array
 from ..models._model import Model
 from ._neck_equations_runtime import NECK_SENSOR_RATE
 from ._output_error import SETTLING_S, FitProblem, Found, SearchProgress, intervals
-from ._parameters import BODY_PARAMETERS, PARAMETERS, PAYLOAD_CURVE, PAYLOAD_PARAMETERS, RIGID
-from ._parts import choose_parts, describe_parts, extend, parts_of
+from ._parameters import BODY_PARAMETERS, NO_EFFECT, PARAMETERS, PARTS, PAYLOAD_CURVE, PAYLOAD_PARAMETERS, RIGID
+from ._parts import choose_parts, describe_parts, differing, extend, parts_of
 
 # A held input is forgotten after so long [s of a neck's time].
 _MEMORY_S = 3.0
@@ -57,8 +57,8 @@ class GreyBox:
             many more.
         body: what it has beside these numbers: nothing ("rigid"), some of anisotropy, stop (of compression),
             softening, creep, tendons (their angles and arms), homing (where they are stretched alike), arc (how a bend
-            gives them way) and speed (of the drives) joined by "+", "all", or ("auto") those that predict motions left
-            out of a training better.
+            gives them way) and speed (of the drives) joined by "+", "all", or ("auto") all if these predict motions
+            left out of a training better.
     """
 
     evaluations: int = 40
@@ -89,12 +89,12 @@ class GreyBox:
         problem = FitProblem.of(scaled)
         tell = SearchProgress(progress, 4 * self.evaluations * (len(problem.numbers) + 1))
         found = Found(problem, np.zeros(0), self.sensor_delay or 0, np.inf)
-        said: dict[str, object] = {}
+        told, said = tuple(NO_EFFECT), dict[str, object]()
         try:
             found = problem.delayed(self.sensor_delay, self.evaluations, tell)
             parts = parts_of(self.body)
             if parts is None:
-                found, said = choose_parts(found, scaled, self.evaluations, tell)
+                found, told, said = choose_parts(found, scaled, self.evaluations, tell)
             else:
                 found = extend(found, parts, self.evaluations, tell)
         except KeyboardInterrupt:
@@ -104,17 +104,21 @@ class GreyBox:
                 found = Found(problem, x, round(delay), cost)
         if not np.isfinite(found.cost):
             raise DataError("no numbers of the grey box give a finite error; look for wild values in the recording.")
-        model = _model(self, found.problem, scaled, found.delay, found.x)
+        model = _model(self, found.problem, scaled, found.delay, found.x, told)
         progress(1.0, "done")
         return replace(model, findings={**model.findings, **said})
 
 
 def as_found(settings: GreyBox, model: Model) -> GreyBox:
-    """Return the settings for other rows of the robot that `model` is of: with its dead time and its optional parts."""
-    return replace(settings, sensor_delay=int(model.findings["sensor_delay"]), body=str(model.settings["body"]))
+    """Return the settings for other rows of the robot that `model` is of: with its dead time and confirmed parts."""
+    confirmed = model.findings.get("confirmed")
+    body = str(model.settings["body"]) if confirmed is None else "+".join(confirmed) or "rigid"
+    return replace(settings, sensor_delay=int(model.findings["sensor_delay"]), body=body)
 
 
-def _model(settings: GreyBox, problem: FitProblem, scaled: ScaledData, delay: int, x: Vector) -> Model:
+def _model(
+    settings: GreyBox, problem: FitProblem, scaled: ScaledData, delay: int, x: Vector, told: Collection[str]
+) -> Model:
     numbers, load, outputs = problem.decode(x), problem.load(x), scaled.data.outputs.shape[1]
     skip = round(SETTLING_S / problem.sample_time)
     errors = [y - Y for (_, Y), (_, _, _, y) in zip(problem.simulate(x, delay), problem.runs, strict=True)]
@@ -135,6 +139,8 @@ def _model(settings: GreyBox, problem: FitProblem, scaled: ScaledData, delay: in
     }
     settings = replace(settings, body="+".join(problem.parts) or "rigid")
     table = intervals(problem, x, delay)
+    shown = differing(table, told)
+    text = describe_parts(problem.reach, table, shown, scaled.scaling.second)
     for number, row in zip(problem.numbers, table, strict=True):
         if number.is_rate:
             row |= {key: scaled.scaling.second**-1 * row[key] for key in ("value", "low", "high")}
@@ -145,8 +151,10 @@ def _model(settings: GreyBox, problem: FitProblem, scaled: ScaledData, delay: in
         found = delay * problem.sample_time + 1.0 / numbers[NECK_SENSOR_RATE]
         least, most = (float(scaled.scaling.second * (found + off)) for off in (-_FOUND_TOO_LONG_S, _FOUND_TOO_SHORT_S))
         findings["sensor_delay_s"] = [max(least, 0.0), most if delay < max(problem.delays()) else None]
-    if said := describe_parts(problem, x, scaled.scaling.second):
-        findings["found"] = said
+    if text:
+        findings["found"] = text
+    if problem.parts:
+        findings["confirmed"] = [part for part in problem.parts if shown & {number.name for number in PARTS[part]}]
     return scaled.model("greybox", settings, lambda arrays, _: dict(arrays), arrays=arrays, findings=findings)
 
 

@@ -19,12 +19,12 @@ from ._loaded_greybox_runtime import loaded_neck
 from ._neck_equations_runtime import NECK_SUBSTEPS
 from ._parameters import (
     BODY_PARAMETERS,
+    NO_EFFECT,
     OUT_OF_PLANE_PARAMETERS,
     PARAMETERS,
     PARTS,
     PAYLOAD_CURVE,
     PAYLOAD_PARAMETERS,
-    RIGID,
     Parameter,
     payload_parameters,
 )
@@ -155,17 +155,13 @@ class FitProblem:
     def body(self, x: Vector) -> Vector:
         """Return the numbers of the optional parts but the tendons."""
         found = self._found(x)
-        names = [number.name for number in BODY_PARAMETERS]
-        return np.array(
-            [self.reach, *(found.get(name, default) for name, default in zip(names, RIGID[1:], strict=True))]
-        )
+        return np.array([self.reach, *(found.get(n.name, NO_EFFECT[n.name]) for n in BODY_PARAMETERS)])
 
     def load(self, x: Vector) -> Vector:
         """Return the lowest and highest payload [kg] and their parameters; empty for one payload."""
-        found = [
-            self._found(x)[number.name] for number in (*PAYLOAD_PARAMETERS, PAYLOAD_CURVE) if number in self.numbers
-        ]
-        return np.array([*self.payload_range, *found]) if found else np.zeros(0)
+        found = self._found(x)
+        load = [found[number.name] for number in (*PAYLOAD_PARAMETERS, PAYLOAD_CURVE) if number.name in found]
+        return np.array([*self.payload_range, *load]) if load else np.zeros(0)
 
     def _found(self, x: Vector) -> dict[str, float]:
         return {number.name: number.decode(value) for number, value in zip(self.numbers, x, strict=True)}
@@ -290,7 +286,7 @@ def _displaced(found: Mapping[str, float]) -> Vector:
     """Return share, cosines and sines, times the arms, of three tendons that are not where they should be."""
     angles = np.radians([0.0, 120.0, 240.0]) + np.array([0.0, found["angle_2"], found["angle_3"]])
     e = np.array([1.0, found["arm_2"], found["arm_3"]]) * np.array([np.cos(angles), np.sin(angles)])
-    return np.concatenate([[float(np.linalg.norm(e, 2)) ** 2 / 3.0], e.ravel()])
+    return np.concatenate([[np.linalg.eigvalsh(e @ e.T)[-1] / 3.0], e.ravel()])
 
 
 class SearchProgress:

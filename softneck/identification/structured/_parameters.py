@@ -136,6 +136,10 @@ BODY_PARAMETERS = (
     *SOFTENING_PARAMETERS, *CREEP_PARAMETERS[:2], *ANISOTROPY_PARAMETERS, *STOP_PARAMETERS, *ARC_PARAMETERS,
     *HOME_PARAMETERS, *CREEP_PARAMETERS[2:], *SPEED_PARAMETERS,
 )  # fmt: skip
+# The values of optional numbers that change nothing.
+NO_EFFECT = {number.name: number.guess for number in TENDON_PARAMETERS} | {
+    number.name: float(value) for number, value in zip(BODY_PARAMETERS, RIGID[1:], strict=True)
+}
 
 # Those that have no meaning where the link bends in one plane.
 OUT_OF_PLANE_PARAMETERS = ("asymmetry", "rest_roll", "twist")

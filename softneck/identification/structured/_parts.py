@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -14,20 +15,17 @@ from ..models._fitting import ScaledData
 from ..models._left_out import Fold, Judged, folds, other_motion
 from ..models._scores import nrmse_fit
 from ._output_error import FitProblem, Found, SearchProgress
-from ._parameters import PARTS
+from ._parameters import NO_EFFECT, PARTS
 
-# Steps of a search on a part of the rows, from what was found on all.
-_STEPS = 4
-# Steps of the search on all rows from there: later ones moved no test's fit by more than 0.1 points (six necks).
-_LAST_STEPS = 12
-# The speed of drives shows in their logged motors: it is kept where the squared error of all rows falls to this part,
-# and not tried where not. After `_STEPS` steps it fell to 0.80 or less, or not at all, on 14 recordings of six necks.
+# Steps of a search on a part of the rows, from what was found on all; then of those with all parts (with twelve `paper`
+# is refused them), and of the search on all rows from there: six more moved no test's fit by more than 0.2 points.
+_FIRST_STEPS, _STEPS, _LAST_STEPS = 4, 16, 6
+# The speed of drives shows in their logged motors: it is kept alone where the squared error of all rows falls to this
+# part. After `_FIRST_STEPS` steps it fell to 0.80 or less, or not at all, on 14 recordings of six necks.
 SPEED, _SPEED_SHOWS = "speed", 0.9
-# What a part must gain [points]: seeds of the noise move fits by as much. With one motion what was left out resembles
-# the rest: a part must also gain this share of what is missing to 100 %.
-_LEAST_GAIN, _LEAST_SHARE = 0.5, 0.2
-# Parts that were searched at once are dropped again where taking them out costs no more [points].
-_HARDLY = 0.1
+# What all parts must gain, and what must be lost without one that is told of [points]: seeds of the noise move fits by
+# as much.
+_LEAST_GAIN = 0.5
 
 
 def parts_of(body: str) -> tuple[str, ...] | None:
@@ -89,84 +87,61 @@ class _Trial:
 
 def choose_parts(
     found: Found, scaled: ScaledData, evaluations: int, tell: SearchProgress
-) -> tuple[Found, dict[str, object]]:
-    """Return the fit with the parts that motions left out confirm, and for each the worst fit to these [%].
+) -> tuple[Found, tuple[str, ...], dict[str, object]]:
+    """Return the fit, with all optional parts if motions left out confirm them, the numbers to tell of, and findings.
 
-    Forward selection: of all parts, and of all that are left at once, those whose fits to what trainings did not see
-    have the best worst, as long as it gains. Left out are whole runs where they are of different motions, else the
-    largest and the fastest motions, and the phases of a run.
+    Left out are motions where there are several, in runs or in the phases of one, else the largest and the fastest. A
+    part that does not show is held by its prior. Else the speed of drives is kept if logged motors show it.
     """
-    steps, left = min(evaluations, _STEPS), _able(found.problem)
-    limited = extend(found, (SPEED,), steps, tell) if found.problem.logged else found
-    shows = limited.cost < _SPEED_SHOWS * found.cost
-    if found.problem.logged and not shows:
-        left.remove(SPEED)
     left_out, several = folds(scaled.data, scaled.data, other_excitation=False), other_motion(scaled.data)
-    left_out = left_out[1:] if several and len(scaled.data.runs()) > 1 else left_out
-    trials = sorted((_trial(found, scaled, fold, steps, tell) for fold in left_out), key=_Trial.fit)
-    least = min((one.fit() for one in trials), default=np.inf)
-    kept, chosen = {"rigid": least}, []
-    while left and trials:
-        tried = {}
-        for parts in [(part,) for part in left] + [tuple(left)] * (len(left) > 1):
-            tell.what = f"parts: {', '.join(parts)}"
-            tried[parts] = _extended(trials, parts, least, steps, tell)
-        fits = {parts: fit for parts, (fit, _) in tried.items()}
-        more = 0.0 if several else _LEAST_SHARE * (100.0 - least)
-        good = [one for one in fits if fits[one] > least + max(_LEAST_GAIN, more)]
-        if not good:
-            break
-        best = max(good, key=lambda parts: fits[parts])
-        left = [part for part in left if part not in best and fits[(part,)] > least]
-        least, trials = tried[best]
-        if len(best) > 1:
-            least, trials, best = _needed(trials, best)
-        kept["+".join(best)] = least
-        chosen += best
-    if not chosen:
-        whole = limited.problem
-        return whole.search(limited.x, limited.delay, evaluations, tell) if shows else found, {}
-    last = trials[0].found
-    if shows and SPEED not in chosen:
-        last, chosen = extend(last, (SPEED,), 1, tell), [*chosen, SPEED]
-    tell.what = "parts"
-    larger = found.problem.as_sure_as(found.x, found.delay).with_parts(*chosen)
+    left_out = left_out[1:] if several else left_out
+    parts, first, steps = _able(found.problem), min(evaluations, _FIRST_STEPS), min(evaluations, _STEPS)
+    coarse = replace(found, problem=found.problem.coarse())
+    rigid = [_trial(coarse, scaled, fold, first, tell) for fold in left_out]
+    whole = [replace(one, found=extend(one.found, parts, steps, tell)) for one in rigid]
+    fits = {name: min((one.fit() for one in each), default=np.inf) for name, each in (("rigid", rigid), ("all", whole))}
+    if not fits["all"] > fits["rigid"] + _LEAST_GAIN:
+        limited = extend(found, (SPEED,), first, tell) if found.problem.logged else found
+        shows = limited.cost < _SPEED_SHOWS * found.cost
+        chosen = limited.problem.search(limited.x, found.delay, evaluations, tell) if shows else found
+        return chosen, tuple(NO_EFFECT), {}
+    last = min(whole, key=_Trial.fit).found
+    larger = found.problem.as_sure_as(found.x, found.delay).with_parts(*parts)
+    chosen = larger.search(last.x, found.delay, min(evaluations, _LAST_STEPS), tell)
     # A simulation that diverged has no number.
-    said: dict[str, object] = {"parts": {part: max(fit, 0.0) for part, fit in kept.items()}}
-    return larger.search(last.x, found.delay, min(evaluations, _LAST_STEPS), tell), said
+    return chosen, _found_again(chosen, whole), {"parts": {name: max(fit, 0.0) for name, fit in fits.items()}}
 
 
-def _extended(
-    trials: list[_Trial], parts: Sequence[str], least: float, steps: int, tell: SearchProgress
-) -> tuple[float, list[_Trial]]:
-    """Return the worst fit [%] of trials with more parts, and these; the rest is left where one gains nothing."""
-    found, worst = [], np.inf
-    for one in trials:
-        found.append(replace(one, found=extend(one.found, parts, steps, tell)))
-        worst = min(worst, found[-1].fit())
-        if worst <= least:
-            break
-    return worst, found
+def _found_again(chosen: Found, trials: list[_Trial]) -> tuple[str, ...]:
+    """Return the optional numbers whose effect is at least half as large in every training that left motions out.
 
+    They are of parts without which what was left out is fitted worse.
+    """
 
-def _needed(trials: list[_Trial], parts: Sequence[str]) -> tuple[float, list[_Trial], tuple[str, ...]]:
-    """Return worst fit, trials and parts without those that the fits hardly need."""
-    at_first = min(one.fit() for one in trials)
-    while len(parts) > 1:
-        tried = {part: [one.without(part) for one in trials] for part in parts}
-        fits = {part: min(one.fit() for one in shorter) for part, shorter in tried.items()}
-        idle = max(parts, key=lambda part: fits[part])
-        if fits[idle] < at_first - _HARDLY:
-            break
-        trials, parts = tried[idle], [part for part in parts if part != idle]
-    return min(one.fit() for one in trials), trials, tuple(parts)
+    def effects(found: Found, part: str) -> Vector:
+        pairs = zip(found.problem.numbers, found.x, strict=True)
+        return np.array([x - number.encode(NO_EFFECT[number.name]) for number, x in pairs if number in PARTS[part]])
+
+    least, names = min(one.fit() for one in trials), []
+    for part in chosen.problem.parts:
+        whole, parts = effects(chosen, part), [effects(one.found, part) for one in trials]
+        again = np.all([np.sign(whole) * part >= 0.5 * np.abs(whole) for part in parts], axis=0)
+        if min(one.without(part).fit() for one in trials) < least - _LEAST_GAIN:
+            names += [number.name for number, same in zip(PARTS[part], again, strict=True) if same]
+    return tuple(names)
 
 
 def _trial(found: Found, scaled: ScaledData, fold: Fold, evaluations: int, tell: SearchProgress) -> _Trial:
     def problem_of(recording: Recording) -> FitProblem:
         whole = found.problem
         own = FitProblem.of(replace(scaled, data=recording), whole.drive_delays)
-        return replace(own, numbers=whole.numbers, payload_range=whole.payload_range, reach=whole.reach)
+        return replace(
+            own,
+            numbers=whole.numbers,
+            payload_range=whole.payload_range,
+            reach=whole.reach,
+            substeps=whole.substeps,
+        )
 
     problem = problem_of(fold.train)
     return _Trial(
@@ -175,45 +150,80 @@ def _trial(found: Found, scaled: ScaledData, fold: Fold, evaluations: int, tell:
     )
 
 
-def describe_parts(problem: FitProblem, x: Vector, second: float) -> str:
-    """Return in words what the optional numbers say; `second`: of the equations' time in SI [s]."""
-    found = {number.name: number.decode(value) for number, value in zip(problem.numbers, x, strict=True)}
-    parts = []
-    reach = np.degrees(problem.reach)
-    if "coupling" in found:
-        stiffer = np.hypot(found["asymmetry"], found["coupling"])
-        along = 0.5 * np.degrees(np.arctan2(found["coupling"], found["asymmetry"])) % 180.0
-        lobes = np.hypot(found["lobe_pitch"], found["lobe_roll"])
-        toward = np.degrees(np.arctan2(-found["lobe_roll"], found["lobe_pitch"])) / 3.0 % 120.0
-        parts.append(
-            f"stiffness is {100.0 * stiffer:.0f} % larger than its mean along {along:.0f} deg, and at {reach:.0f} deg "
-            f"{100.0 * lobes:.0f} % larger towards {toward:.0f} deg and each 120 deg from there"
-        )
-    if "stop" in found and found["stop"] > 0.0:
-        parts.append(f"beyond a compression of {1.0 / found['stop']:.2g} rad of motor the link is ten times stiffer")
-    if "softening" in found:
-        fall = 1.0 - 1.0 / (1.0 + found["softening"])
-        parts.append(
-            f"stiffness falls by {100.0 * fall:.0f} % from rest to {reach:.0f} deg, "
-            f"and by {100.0 * found['lasting_softening'] * (1.0 - np.exp(-2.0)):.0f} % after a bend of {reach:.0f} deg"
-        )
-    if "creep" in found:
-        for creep in ("creep", "slow_creep"):
-            share = found[creep] / (1.0 + found["creep"] + found["slow_creep"])
-            seconds = second / found[f"{creep}_rate"]
-            parts.append(f"{100.0 * share:.0f} % of the stiffness creeps away with a time constant of {seconds:.2g} s")
-    if "angle_2" in found:
-        for j, nominal in ((2, 120.0), (3, 240.0)):
-            angle = nominal + np.degrees(found[f"angle_{j}"])
-            parts.append(f"tendon {j} stands at {angle:.0f} deg with {found[f'arm_{j}']:.2f} of the arm of tendon 1")
-    if "home_pitch" in found:
-        pitch, roll = np.degrees([found["home_pitch"], found["home_roll"]])
-        parts.append(f"tendons are stretched alike at {pitch:.1f} deg of pitch and {roll:.1f} deg of roll")
-    if "arc" in found:
-        parts.append(
-            f"a bend of {reach:.0f} deg takes {found['arc'] * problem.reach**2:.2g} rad of motor off each tendon"
-        )
-    if "top_speed" in found:
-        parts.append(f"drives turn at up to {found['top_speed'] / second:.2g} rad/s")
-        parts.append(f"their friction takes {100.0 * found['drag']:.0f} % of the largest pull")
-    return "; ".join(parts)
+def differing(table: Sequence[Mapping[str, Any]], told: Collection[str]) -> set[str]:
+    """Return the optional numbers of those in `told` whose 95 % interval excludes no effect; table: see `intervals`."""
+    rows = [row for row in table if row["name"] in told]
+    return {row["name"] for row in rows if not row["low"] <= NO_EFFECT[row["name"]] <= row["high"]}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Words:
+    """The numbers: rows of `intervals` by name, and those to tell of."""
+
+    rows: Mapping[str, Mapping[str, Any]]
+    shows: set[str]
+
+    def value(self, name: str) -> float:
+        return self.rows[name]["value"]
+
+    def range(self, name: str, of: Callable[[float], float], digits: str = ".0f") -> str:
+        """Return a function of the number with its 95 % confidence."""
+        value, *ends = (of(self.rows[name][key]) for key in ("value", "low", "high"))
+        return f"{value:{digits}} ({min(ends):{digits}} to {max(ends):{digits}})"
+
+
+def describe_parts(reach: float, table: Sequence[Mapping[str, Any]], shown: set[str], second: float) -> str:
+    """Return in words what the optional numbers `shown` say.
+
+    reach: [rad]; table: see `intervals`; second: of the equations' time in SI [s].
+    """
+    words = _Words({row["name"]: row for row in table}, shown)
+    return "; ".join([*_of_stiffness(words, reach, second), *_of_tendons(words, reach), *_of_drives(words, second)])
+
+
+def _of_stiffness(words: _Words, reach: float, second: float) -> Iterator[str]:
+    shows, value, degrees = words.shows, words.value, f"{np.degrees(reach):.0f} deg"
+    if "coupling" in shows:
+        stiffer = 100.0 * np.hypot(value("asymmetry"), value("coupling"))
+        along = 0.5 * np.degrees(np.arctan2(value("coupling"), value("asymmetry"))) % 180.0
+        yield f"stiffness is {stiffer:.0f} % larger than its mean along {along:.0f} deg"
+    if shows & {"lobe_pitch", "lobe_roll"}:
+        lobes = 100.0 * np.hypot(value("lobe_pitch"), value("lobe_roll"))
+        toward = np.degrees(np.arctan2(-value("lobe_roll"), value("lobe_pitch"))) / 3.0 % 120.0
+        yield f"at {degrees} it is {lobes:.0f} % stiffer towards {toward:.0f} deg and each 120 deg from there"
+    if "stop" in shows:
+        where = words.range("stop", lambda stop: 1.0 / stop, ".2g")
+        yield f"beyond a compression of {where} rad of motor the link is ten times stiffer"
+    if "softening" in shows:
+        fall = words.range("softening", lambda softening: 100.0 * softening / (1.0 + softening))
+        yield f"stiffness falls by {fall} % from rest to {degrees}"
+    if "lasting_softening" in shows:
+        fall = words.range("lasting_softening", lambda softening: 100.0 * softening * (1.0 - np.exp(-2.0)))
+        yield f"stiffness falls by {fall} % after a bend of {degrees}"
+    for creep in sorted(shows & {"creep", "slow_creep"}):
+        rest = 1.0 + value("creep") + value("slow_creep") - value(creep)
+        share = words.range(creep, lambda part, rest=rest: 100.0 * part / (rest + part))
+        seconds = second / value(f"{creep}_rate")
+        yield f"{share} % of the stiffness creeps away with a time constant of {seconds:.2g} s"
+
+
+def _of_tendons(words: _Words, reach: float) -> Iterator[str]:
+    for j, nominal in ((2, 120.0), (3, 240.0)):
+        if words.shows & {f"angle_{j}", f"arm_{j}"}:
+            angle = words.range(f"angle_{j}", lambda angle, nominal=nominal: nominal + np.degrees(angle))
+            arm = words.range(f"arm_{j}", float, ".2f")
+            yield f"tendon {j} stands at {angle} deg with {arm} of the arm of tendon 1"
+    if words.shows & {"home_pitch", "home_roll"}:
+        pitch, roll = (words.range(name, np.degrees, ".1f") for name in ("home_pitch", "home_roll"))
+        yield f"tendons are stretched alike at {pitch} deg of pitch and {roll} deg of roll"
+    if "arc" in words.shows:
+        way = words.range("arc", lambda arc: arc * reach**2, ".2g")
+        yield f"a bend of {np.degrees(reach):.0f} deg takes {way} rad of motor off each tendon"
+
+
+def _of_drives(words: _Words, second: float) -> Iterator[str]:
+    if "top_speed" in words.shows:
+        yield f"drives turn at up to {words.range('top_speed', lambda speed: speed / second, '.3g')} rad/s"
+    if "drag" in words.shows:
+        friction = words.range("drag", lambda drag: 100.0 * drag)
+        yield f"friction of moving drives takes {friction} % of the largest pull"
