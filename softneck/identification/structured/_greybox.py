@@ -137,7 +137,7 @@ def _model(
         "memory": memory_array(_MEMORY_S, problem.sample_time),
         **({"payload": load} if load.size else {}),
     }
-    settings = replace(settings, body="+".join(problem.parts) or "rigid")
+    chosen = replace(settings, body="+".join(problem.parts) or "rigid")
     table = intervals(problem, x, delay)
     shown = differing(table, told)
     text = describe_parts(problem.reach, table, shown, scaled.scaling.second)
@@ -153,9 +153,9 @@ def _model(
         findings["sensor_delay_s"] = [max(least, 0.0), most if delay < max(problem.delays()) else None]
     if text:
         findings["found"] = text
-    if problem.parts:
+    if problem.parts and settings.body == "auto":  # parts that were asked for need no confirmation
         findings["confirmed"] = [part for part in problem.parts if shown & {number.name for number in PARTS[part]}]
-    return scaled.model("greybox", settings, lambda arrays, _: dict(arrays), arrays=arrays, findings=findings)
+    return scaled.model("greybox", chosen, lambda arrays, _: dict(arrays), arrays=arrays, findings=findings)
 
 
 def check_greybox(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
