@@ -57,8 +57,8 @@ class GreyBox:
             many more.
         body: what it has beside these numbers: nothing ("rigid"), some of anisotropy, stop (of compression),
             softening, creep, tendons (their angles and arms), homing (where they are stretched alike), arc (how a bend
-            gives them way) and speed (of the drives) joined by "+", "all", or ("auto") all if these predict motions
-            left out of a training better.
+            gives them way) and speed (of the drives) joined by "+", "all", or ("auto") all, or those that are needed,
+            if they predict motions left out of a training better.
     """
 
     evaluations: int = 40

@@ -23,9 +23,9 @@ _FIRST_STEPS, _STEPS, _LAST_STEPS = 4, 16, 6
 # The speed of drives shows in their logged motors: it is kept alone where the squared error of all rows falls to this
 # part. After `_FIRST_STEPS` steps it fell to 0.80 or less, or not at all, on 14 recordings of six necks.
 SPEED, _SPEED_SHOWS = "speed", 0.9
-# What all parts must gain, and what must be lost without one that is told of [points]: seeds of the noise move fits by
-# as much.
-_LEAST_GAIN = 0.5
+# What parts must gain, and what must be lost without one that is told of [points]: seeds of the noise move fits by as
+# much. Where all fit badly parts must also gain this share of what is missing to 100 %.
+_LEAST_GAIN, _LEAST_SHARE = 0.5, 0.1
 
 
 def parts_of(body: str) -> tuple[str, ...] | None:
@@ -88,10 +88,11 @@ class _Trial:
 def choose_parts(
     found: Found, scaled: ScaledData, evaluations: int, tell: SearchProgress
 ) -> tuple[Found, tuple[str, ...], dict[str, object]]:
-    """Return the fit, with all optional parts if motions left out confirm them, the numbers to tell of, and findings.
+    """Return the fit, with optional parts if motions left out confirm them, the numbers to tell of, and findings.
 
-    Left out are motions where there are several, in runs or in the phases of one, else the largest and the fastest. A
-    part that does not show is held by its prior. Else the speed of drives is kept if logged motors show it.
+    All are kept if these gain, else those without one of which what was left out is fitted worse, if they do. Left out
+    are motions where there are several, in runs or in the phases of one, else the largest and the fastest. A part that
+    does not show is held by its prior. Else the speed of drives is kept if logged motors show it.
     """
     left_out, several = folds(scaled.data, scaled.data, other_excitation=False), other_motion(scaled.data)
     left_out = left_out[1:] if several else left_out
@@ -100,7 +101,11 @@ def choose_parts(
     rigid = [_trial(coarse, scaled, fold, first, tell) for fold in left_out]
     whole = [replace(one, found=extend(one.found, parts, steps, tell)) for one in rigid]
     fits = {name: min((one.fit() for one in each), default=np.inf) for name, each in (("rigid", rigid), ("all", whole))}
-    if not fits["all"] > fits["rigid"] + _LEAST_GAIN:
+    wanted = fits["rigid"] + max(_LEAST_GAIN, _LEAST_SHARE * (100.0 - fits["rigid"]))
+    if whole and not fits["all"] > wanted:
+        parts, whole = _needed(whole, parts, fits["all"])
+        fits["+".join(parts) or "rigid"] = min(one.fit() for one in whole)
+    if not max(fits.values()) > wanted:
         limited = extend(found, (SPEED,), first, tell) if found.problem.logged else found
         shows = limited.cost < _SPEED_SHOWS * found.cost
         chosen = limited.problem.search(limited.x, found.delay, evaluations, tell) if shows else found
@@ -110,6 +115,14 @@ def choose_parts(
     chosen = larger.search(last.x, found.delay, min(evaluations, _LAST_STEPS), tell)
     # A simulation that diverged has no number.
     return chosen, _found_again(chosen, whole), {"parts": {name: max(fit, 0.0) for name, fit in fits.items()}}
+
+
+def _needed(trials: list[_Trial], parts: list[str], least: float) -> tuple[list[str], list[_Trial]]:
+    """Return the parts without one of which what was left out is fitted worse than `least`, and trials with these."""
+    idle = [part for part in parts if min(one.without(part).fit() for one in trials) >= least]
+    for part in idle:
+        trials = [one.without(part) for one in trials]
+    return [part for part in parts if part not in idle], trials
 
 
 def _found_again(chosen: Found, trials: list[_Trial]) -> tuple[str, ...]:

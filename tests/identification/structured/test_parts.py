@@ -51,6 +51,10 @@ class Trial:
     def fit(self) -> float:
         return 50.0 + sum(self.gains.get(part, 0.0) for part in self.found.problem.parts)
 
+    def without(self, part: str) -> Trial:
+        parts = tuple(one for one in self.found.problem.parts if one != part)
+        return replace(self, found=_found(replace(self.found.problem, parts=parts)))
+
 
 def _found(problem: Any, cost: float = 1.0) -> Found:
     x: Any = problem.parts
@@ -59,31 +63,44 @@ def _found(problem: Any, cost: float = 1.0) -> Found:
 
 @pytest.mark.parametrize(("spatial", "able"), [(True, 8), (False, 6)], ids=["two outputs", "a plane"])
 @pytest.mark.parametrize("cost", [0.85, 0.95], ids=["speed shows", "it does not"])
-@pytest.mark.parametrize(("gain", "kept"), [(0.4, False), (0.6, True), (-20.0, False), (None, False)])
-def test_all_parts_are_kept_where_what_was_left_out_is_fitted_better(
-    gain: float | None, kept: bool, cost: float, spatial: bool, able: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Half a point is what seeds of the noise move fits by; None: too little was recorded to leave anything out."""
+@pytest.mark.parametrize(
+    ("gains", "kept"),
+    [
+        ({"creep": 4.9}, ()),
+        ({"creep": 5.1}, ("all",)),
+        ({"creep": -20.0}, ()),
+        ({"creep": 10.0, "stop": -20.0}, ("creep",)),
+        ({"creep": 4.0, "stop": -20.0}, ()),
+        (None, ()),
+    ],
+)
+def test_parts_are_kept_where_what_was_left_out_is_fitted_better(
+    gains: dict[str, float] | None, kept: tuple[str, ...], cost: float, spatial: bool, able: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """They must gain a tenth of the 50 points that are missing; None: too little was recorded to leave anything out."""
 
     def extend(found: Any, parts: Sequence[str], _evaluations: int, _tell: Any) -> Any:
         return _found(found.problem.with_parts(*parts), cost if tuple(parts) == ("speed",) else 1.0)
 
     monkeypatch.setattr(_parts, "extend", extend)
-    monkeypatch.setattr(_parts, "folds", lambda *_, **__: [] if gain is None else [None])
+    monkeypatch.setattr(_parts, "folds", lambda *_, **__: [] if gains is None else [None])
     monkeypatch.setattr(_parts, "other_motion", lambda _: False)
     monkeypatch.setattr(_parts, "_Trial", Trial)
-    monkeypatch.setattr(_parts, "_trial", lambda found, *_: Trial(found, {"creep": gain or 0.0}))
+    monkeypatch.setattr(_parts, "_trial", lambda found, *_: Trial(found, gains or {}))
     monkeypatch.setattr(_parts, "_found_again", lambda *_: ("arc",))
     scaled: Any = SimpleNamespace(data=None)
     rigid = _found(Problem((), True, has_two_outputs=spatial))
     chosen, told, said = _parts.choose_parts(rigid, scaled, 4, SearchProgress(silent, 4))
-    if kept:
+    if kept == ("all",):
         assert len(chosen.problem.parts) == able
     else:  # what logged motors show needs no rows left out
-        assert chosen.problem.parts == (("speed",) if cost < 0.9 else ())
+        assert chosen.problem.parts == (kept or (("speed",) if cost < 0.9 else ()))
     # Of parts that motions left out confirm only what each training finds again is told.
     assert told == (("arc",) if kept else tuple(NO_EFFECT))
-    assert said == ({"parts": {"rigid": 50.0, "all": 50.0 + (gain or 0.0)}} if kept else {})
+    gained = gains or {"creep": 0.0}
+    fits = {"rigid": 50.0, "all": 50.0 + sum(gained.values()), "+".join(kept): 50.0 + gained["creep"]}
+    assert said == ({"parts": fits} if kept else {})
 
 
 @dataclass(frozen=True)
