@@ -24,7 +24,7 @@ _FIRST_STEPS, _STEPS, _LAST_STEPS = 4, 16, 6
 # part. After `_FIRST_STEPS` steps it fell to 0.80 or less, or not at all, on 14 recordings of six necks.
 SPEED, _SPEED_SHOWS = "speed", 0.9
 # What parts must gain, and what must be lost without one that is told of [points]: seeds of the noise move fits by as
-# much. Where all fit badly parts must also gain this share of what is missing to 100 %.
+# much. Those that what was left out chose itself must also gain this share of what is missing to 100 %.
 _LEAST_GAIN, _LEAST_SHARE = 0.5, 0.1
 
 
@@ -101,11 +101,12 @@ def choose_parts(
     rigid = [_trial(coarse, scaled, fold, first, tell) for fold in left_out]
     whole = [replace(one, found=extend(one.found, parts, steps, tell)) for one in rigid]
     fits = {name: min((one.fit() for one in each), default=np.inf) for name, each in (("rigid", rigid), ("all", whole))}
-    wanted = fits["rigid"] + max(_LEAST_GAIN, _LEAST_SHARE * (100.0 - fits["rigid"]))
-    if whole and not fits["all"] > wanted:
+    confirmed = fits["all"] > fits["rigid"] + _LEAST_GAIN
+    if whole and not confirmed:
         parts, whole = _needed(whole, parts, fits["all"])
-        fits["+".join(parts) or "rigid"] = min(one.fit() for one in whole)
-    if not max(fits.values()) > wanted:
+        fits["+".join(parts) or "rigid"] = fit = min(one.fit() for one in whole)
+        confirmed = fit > fits["rigid"] + max(_LEAST_GAIN, _LEAST_SHARE * (100.0 - fits["rigid"]))
+    if not confirmed:
         limited = extend(found, (SPEED,), first, tell) if found.problem.logged else found
         shows = limited.cost < _SPEED_SHOWS * found.cost
         chosen = limited.problem.search(limited.x, found.delay, evaluations, tell) if shows else found
