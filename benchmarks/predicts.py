@@ -1,6 +1,6 @@
 """Print how well `identify auto` predicts: its scores beside what the kinds are then worth on tests it never saw.
 
-`python benchmarks/predicts.py [--necks NECK...] [--seed N] [--workers N] [--fresh] [--each [--kinds KIND...]]`
+`python benchmarks/predicts.py [--necks NECK...] [--seed N] [--workers N] [--fresh] [--two | --each [--kinds KIND...]]`
 
 On each neck `choose` gets 140 s of Eq. 22, the last 30 % held out. What a kind is truly worth is its worst axis of
 steps, sine and rotation in free run, trained with its defaults on the whole 140 s: from `benchmarks/baseline.py`, which
@@ -8,6 +8,8 @@ computes what is not kept. Printed for each neck: the rank correlation (Spearman
 the truth, that of the hold-out alone, what `auto` expects of the chosen model on other motions, and the regret: the
 best kind's worst axis less that of the chosen model.
 Choices are kept in `build/predicts`; they are of the code that made them: use --fresh after a change.
+
+`--two`: what `auto` chooses of these 140 s and 60 s of `mixed`, what it expects and what the model is worth.
 
 `--each`: how well the first figure that `identify KIND` prints predicts: what it expects of other motions. Each kind is
 identified from 140 s of Eq. 22, and from these and 60 s of `mixed`. Printed: that figure, the same with factors of the
@@ -32,7 +34,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.baseline import MODELS, Job, compute, recorded, records_of_tests, training
 from softneck.identification import INFINITE, Model, SetMembership, choose, identify, validate
 from softneck.identification.selection._examination import MISSING, Examination, part_of_reference
-from softneck.signals import signal
+from softneck.signals import Recording, signal
 from tests.foreign_necks.kept import keep, kept_lines
 from tests.foreign_necks.necks import CHOOSING
 
@@ -94,13 +96,30 @@ def choices(necks: list[str], seed: int, workers: int, *, fresh: bool) -> dict[s
     return {neck: known[neck] for neck in necks}
 
 
+def print_two(necks: list[str], seed: int) -> None:
+    """Print what `auto` chooses of two recordings, what it expects of other motions, and what the model is worth."""
+    print(f"{'neck':8}{'chosen':>10}{'expected':>17}{'worth':>7}")
+    for neck in necks:
+        with threadpool_limits(1):
+            model = identify("auto", two_motions(neck, seed), seed=seed)
+        said = model.findings["examination"]
+        expected, low, high = (_number(said[key]) for key in ("expected", "low", "high"))
+        interval = f"{expected:.1f} ({low:.0f}..{high:.0f})"
+        print(f"{neck:8}{model.kind:>10}{interval:>17}{worst_axis(model, neck, seed):7.1f}", flush=True)
+
+
+def two_motions(neck: str, seed: int) -> list[Recording]:
+    """Return 140 s of Eq. 22 and 60 s of `mixed` of a neck."""
+    return [training(neck, seed), recorded(neck, signal("mixed", duration=60.0), 10 * seed + 5)]
+
+
 # What a score may be off [points].
 NEAR = 5.0
 
 
 def each(neck: str, kind: str, motions: int, seed: int) -> dict[str, Any]:
     """Return what `identify KIND` prints of its model and what this model is worth, worst axis [%]."""
-    parts = [training(neck, seed), recorded(neck, signal("mixed", duration=60.0), 10 * seed + 5)][:motions]
+    parts = two_motions(neck, seed)[:motions]
     begin = processor_seconds()
     with threadpool_limits(1):
         model = identify(kind, parts)
@@ -171,11 +190,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of noise and of kinds that start at random (0)")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (all cores)")
     parser.add_argument("--fresh", action="store_true", help="choose again; the baseline stays")
+    parser.add_argument("--two", action="store_true", help="what `auto` chooses of two recordings")
     parser.add_argument("--each", action="store_true", help="what `identify KIND` prints of each kind")
     parser.add_argument("--kinds", nargs="+", choices=MODELS, default=list(MODELS), help="of --each (all)")
     wanted = parser.parse_args()
     if wanted.each:
         print_each(wanted.necks, wanted.kinds, wanted.seed, fresh=wanted.fresh)
+        return
+    if wanted.two:
+        print_two(wanted.necks, wanted.seed)
         return
     jobs = [Job(neck, kind, wanted.seed) for neck in wanted.necks for kind in KINDS]
     truths = {
