@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from softneck.identification import PAPER_EQ21
+from softneck.identification import PAPER_EQ21, Model
 from softneck.identification.linear._regression import no_base
 from softneck.identification.set_membership._regressor import all_pairs_gammas, least_gammas, set_arrays
 from softneck.runtime import load_functions, load_runtime
@@ -40,7 +40,7 @@ def next_angle(x: np.ndarray) -> np.ndarray:
 
 
 @cache
-def arrays_of(rows: int) -> tuple[np.ndarray, ...]:
+def arrays_of(rows: int) -> dict[str, np.ndarray]:
     """The arrays of a model over `rows` points of Eq. 21's ten regressors along a motion."""
     u, rng = motion(rows, seed=1), np.random.default_rng(0)
     X = np.empty((rows, 10))
@@ -54,19 +54,20 @@ def arrays_of(rows: int) -> tuple[np.ndarray, ...]:
         y = 0.5 * y + v[k] + SIGMA * rng.standard_normal()
     values = next_angle(X) + SIGMA * rng.standard_normal(rows)
     points = [(np.ascontiguousarray(X.T), values)] * 2
-    return (
-        np.array([3.0]),
-        np.zeros((3, 2)),
-        PAPER_EQ21,
-        np.ones(10),
-        *set_arrays(points, np.full(2, GAMMA), np.full(2, EPSILON)).values(),
-        *no_base().values(),
-    )
+    return {
+        "history": np.array([3.0, 2.0]),
+        "drive": np.zeros((3, 2)),
+        "table": PAPER_EQ21,
+        "scale": np.ones(10),
+        **set_arrays(points, np.full(2, GAMMA), np.full(2, EPSILON)),
+        **no_base(),
+    }
 
 
 def free_run(rows: int, *, compiled: bool = True, steps: int = STEPS) -> tuple[Callable[[], np.ndarray], int]:
     """Return a free run over another motion, and how many queries it makes."""
-    runtime, arrays = load_runtime(RUNTIME, compiled=compiled), arrays_of(rows)
+    runtime = load_runtime(RUNTIME, compiled=compiled)
+    arrays = Model(kind="nlsm", sample_time=0.02, arrays=arrays_of(rows)).block().arrays
     U = np.full((steps, 8), np.nan)
     U[:, :3] = motion(steps - 3, seed=2)
     parameters = np.zeros(5)
@@ -149,7 +150,7 @@ def test_tree_beside_numpy(benchmark: BenchmarkFixture) -> None:
     """All in one run, a round of each after a round of the others, so that a busy machine is busy for all."""
     run, queries = free_run(7_000)
     arrays = arrays_of(7_000)
-    W, y = arrays[4][0], arrays[5][0]
+    W, y, tree, frame = (arrays[name][0] for name in ("points", "values", "nodes", "frame"))
     outputs = benchmark.pedantic(run, rounds=5)
     # The same motion, from where the output lies as in the free run.
     u = motion(STEPS - 3, seed=2)
@@ -160,9 +161,7 @@ def test_tree_beside_numpy(benchmark: BenchmarkFixture) -> None:
     X[1:, 0] = outputs[:-1, 0]
     X = X[10::20]
     functions = load_functions("softneck.identification.set_membership._principal_tree_runtime")
-    expected = [functions.slant_bounds(W, y, arrays[7][0], arrays[8][0], GAMMA, x) for x in X] + np.array(
-        [-EPSILON, EPSILON]
-    )
+    expected = [functions.slant_bounds(W, y, tree, frame, GAMMA, x) for x in X] + np.array([-EPSILON, EPSILON])
     plain = load_functions(RUNTIME).nlsm_bounds
     ways = {how: by_numpy(how, W, y) for how in NUMPY}
     ways["compiled, all points"] = lambda x: plain(W, y, GAMMA, EPSILON, x)
@@ -181,10 +180,42 @@ def test_tree_beside_numpy(benchmark: BenchmarkFixture) -> None:
     assert best["tree"] < 5e-6
 
 
+def principal_directions(points: np.ndarray) -> int:
+    """Return how many principal directions of points (rows, n) have 99.9 % of the variance."""
+    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) ** 2
+    return int(np.searchsorted(np.cumsum(sizes), 0.999 * sizes.sum())) + 1
+
+
+@pytest.mark.benchmark(group="the tree where points fill ten dimensions")
+@pytest.mark.parametrize("rows", [7_000, 50_000])
+def test_points_that_fill_ten_dimensions(benchmark: BenchmarkFixture, rows: int) -> None:
+    """Nothing can be left out there: what the tree costs beside a search over all points, and how full each set is."""
+    rng = np.random.default_rng(0)
+    X, queries = rng.standard_normal((rows, 10)), rng.standard_normal((200, 10))
+    y = next_angle(X) + SIGMA * rng.standard_normal(rows)
+    known = set_arrays([(np.ascontiguousarray(X.T), y)], np.array([GAMMA]), np.array([EPSILON]))
+    W, values, tree, frame = (known[name][0] for name in ("points", "values", "nodes", "frame"))
+    slant = load_functions("softneck.identification.set_membership._principal_tree_runtime").slant_bounds
+    plain = load_functions(RUNTIME).nlsm_bounds
+    ways = {
+        "tree": lambda x: np.add(slant(W, values, tree, frame, GAMMA, x), [-EPSILON, EPSILON]),
+        "compiled, all points": lambda x: np.array(plain(W, values, GAMMA, EPSILON, x)),
+    }
+    by_tree, by_all = (np.array([bounds(x) for x in queries]) for bounds in ways.values())
+    np.testing.assert_allclose(by_tree, by_all, rtol=0, atol=1e-12)
+    benchmark.pedantic(lambda: [ways["tree"](x) for x in queries], rounds=3)
+    for name, bounds in ways.items():
+        taken = seconds(lambda bounds=bounds: [bounds(x) for x in queries]) / len(queries)
+        benchmark.extra_info[name] = f"{1e6 * taken:.1f} us per query"
+    sets = {"along a motion": arrays_of(7_000)["points"][0].T, "independent": X}
+    benchmark.extra_info["directions"] = {name: principal_directions(points) for name, points in sets.items()}
+    print(f"\n{rows} points: {benchmark.extra_info}", end="")
+
+
 @pytest.mark.benchmark(group="building")
 def test_building_a_million(benchmark: BenchmarkFixture) -> None:
     arrays = arrays_of(1_000_000)
-    points, y = arrays[4][0], arrays[5][0]
+    points, y = arrays["points"][0], arrays["values"][0]
     size = points.nbytes + y.nbytes
 
     def build() -> dict[str, np.ndarray]:
@@ -208,7 +239,7 @@ def test_building_a_million(benchmark: BenchmarkFixture) -> None:
 @pytest.mark.parametrize("scaling", ["as it is", "output x 10", "output x 57.3", "by the spread", "noise only"])
 def test_gamma_curve_of_7000(benchmark: BenchmarkFixture, scaling: str) -> None:
     arrays = arrays_of(7_000)
-    points, values = arrays[4][0].copy(), arrays[5][0]
+    points, values = arrays["points"][0].copy(), arrays["values"][0]
     if scaling.startswith("output"):
         points[0] *= float(scaling.split()[-1])
     elif scaling == "by the spread":
