@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -39,7 +39,7 @@ from softneck.runtime import Block
 from softneck.signals import Recording, signal
 
 from ..oracles.bake_off import bake_off_neck
-from .test_set_membership import arrays_of, motion
+from .test_set_membership import model_of, motion
 
 STEPS = 2000
 _TRIVIAL = """
@@ -75,7 +75,7 @@ def _training() -> Recording:
 
 @cache
 def _set(rows: int) -> Block:
-    return replace(SetMembership().fit(_training()).block(), arrays=arrays_of(rows))
+    return model_of(rows).block()
 
 
 @cache

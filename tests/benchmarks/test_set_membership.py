@@ -64,10 +64,15 @@ def arrays_of(rows: int) -> dict[str, np.ndarray]:
     }
 
 
+def model_of(rows: int) -> Model:
+    """The model over `arrays_of` these points."""
+    return Model(kind="nlsm", sample_time=0.02, arrays=arrays_of(rows))
+
+
 def free_run(rows: int, *, compiled: bool = True, steps: int = STEPS) -> tuple[Callable[[], np.ndarray], int]:
     """Return a free run over another motion, and how many queries it makes."""
     runtime = load_runtime(RUNTIME, compiled=compiled)
-    arrays = Model(kind="nlsm", sample_time=0.02, arrays=arrays_of(rows)).block().arrays
+    arrays = model_of(rows).block().arrays
     U = np.full((steps, 8), np.nan)
     U[:, :3] = motion(steps - 3, seed=2)
     parameters = np.zeros(5)
