@@ -55,6 +55,9 @@ class Trial:
         parts = tuple(one for one in self.found.problem.parts if one != part)
         return replace(self, found=_found(replace(self.found.problem, parts=parts)))
 
+    def with_only(self, parts: Sequence[str], _evaluations: int, _tell: Any) -> Trial:
+        return replace(self, found=_found(replace(self.found.problem, parts=tuple(parts))))
+
 
 def _found(problem: Any, cost: float = 1.0) -> Found:
     x: Any = problem.parts
@@ -71,6 +74,9 @@ def _found(problem: Any, cost: float = 1.0) -> Found:
         ({"creep": -20.0}, ()),
         ({"creep": 10.0, "stop": -20.0}, ("creep",)),
         ({"creep": 4.0, "stop": -20.0}, ()),
+        # Alone it leaves 10 of 30 points, or 10 of 15, which are no less than two thirds.
+        ({"arc": 40.0, "stop": -20.0}, ("arc",)),
+        ({"arc": 40.0, "stop": -5.0}, ("all",)),
         (None, ()),
     ],
 )
@@ -101,8 +107,10 @@ def test_parts_are_kept_where_what_was_left_out_is_fitted_better(
         assert chosen.problem.parts == (kept or (("speed",) if cost < 0.9 else ()))
     # Of parts that motions left out confirm only what each training finds again is told.
     assert told == (("arc",) if kept else tuple(NO_EFFECT))
-    gained = gains or {"creep": 0.0}
-    fits = {"rigid": 50.0, "all": 50.0 + sum(gained.values()), "+".join(kept): 50.0 + gained["creep"]}
+    fits = {"rigid": 50.0, "all": 50.0 + sum((gains or {}).values())}
+    fits |= {part: 50.0 + (gains or {}).get(part, 0.0) for part in kept if part != "all"}
+    # That which shows is tried alone where there are others.
+    fits |= {"arc": 50.0 + (gains or {}).get("arc", 0.0)} if kept != ("creep",) else {}
     assert said == ({"parts": fits} if kept else {})
 
 
