@@ -265,8 +265,10 @@ def _trained_on_all(choice: Choice, whole: Recording, train: float, seed: int, p
             model, judged = fit_and_validate(settings, whole, train=train, tolerance=None, progress=part)
             again[one.kind] = replace(one, model=model, judged=judged, examination=None)
     ranking = tuple(again.get(one.kind, one) for one in choice.ranking)
+    if choice.chosen.kind not in again:
+        return replace(choice, ranking=ranking)
     why = f"{choice.why} Then it is trained on all recordings, of each run its first {100.0 * train:.3g} %."
-    return replace(choice, ranking=ranking, chosen=again.get(choice.chosen.kind, choice.chosen), why=why)
+    return replace(choice, ranking=ranking, chosen=again[choice.chosen.kind], why=why)
 
 
 def _split_for_choice(parts: Sequence[Recording], train: float) -> tuple[Recording, Recording, bool]:

@@ -221,10 +221,13 @@ def source_of_family(family: Any, name: str) -> PlantSource:
 
 
 def _decay_of(model: Any) -> float:
-    """Return the time constant [s] in which the slowest oscillation of an identified linear model decays; 0 without."""
+    """Return the time constant [s] in which the slowest oscillation of an identified linear model decays; 0 without.
+
+    What turns within four samples is no motion of a robot, but noise that a model of many poles has fitted.
+    """
     found = getattr(model, "findings", {}).get("transfer_functions", {})
     poles = np.concatenate([np.zeros(0), *(np.roots([1.0, *one["a"]]) for one in found.values())])
-    sizes = np.abs(poles[np.imag(poles) != 0.0])
+    sizes = np.abs(poles[(np.imag(poles) != 0.0) & (np.real(poles) > 0.0)])
     return float(-model.sample_time / np.log(sizes.max())) if sizes.size else 0.0
 
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -118,3 +120,8 @@ def test_requirements_in_seconds_follow_the_decay_of_an_oscillation(damping: flo
     assert Scale.of(recording.robot, [source]).time == pytest.approx(source.decay / 0.2)
     (lag,) = sources_of({"rod": OutputError(nf=1).fit(recording)})
     assert lag.decay == 0.0
+    # A pair of poles beyond a quarter of the sampling rate is no motion, however slowly it decays.
+    known = model.findings["transfer_functions"]["tip"]
+    found = {"tip": {**known, "a": np.poly(0.999 * np.exp([2.0j, -2.0j])).real[1:].tolist()}}
+    (fast,) = sources_of({"rod": replace(model, findings={**model.findings, "transfer_functions": found})})
+    assert fast.decay == 0.0
